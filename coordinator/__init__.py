@@ -1,0 +1,1 @@
+"""The coordinator: runs the task's net, verifies it and forecasts it."""

@@ -1,0 +1,1 @@
+"""Verification and forecast of a net; pure."""

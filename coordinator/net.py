@@ -1,0 +1,137 @@
+"""An ordinary Petri net with weighted and inhibitor arcs: places, transitions, marking, enabled, fire."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+Marking = tuple[int, ...]
+"""Tokens by place, in place order."""
+
+Arcs = tuple[tuple[int, int], ...]
+"""Pairs (place index, weight), sorted by place, weights >= 1; for inhibitors the weight is the threshold."""
+
+
+class NotEnabled(Exception):  # noqa: N818 - a fact about a marking that callers may ask for
+    """A transition was fired in a marking that does not enable it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Net:
+    """An immutable net (P, T, Pre, Post, Inhibit, M0, capacities, priorities).
+
+    `consume[t]`, `produce[t]`, `inhibit[t]` are the arcs of transition t. A transition is enabled in M when
+    M(p) >= w for every consumed (p, w), M(p) < k for every inhibitor (p, k), no capacity would be exceeded, and no
+    transition of higher `priority` is enabled (ISO/IEC 15909-1 for the firing rule; priorities as in GSPN).
+    """
+
+    places: tuple[str, ...]
+    transitions: tuple[str, ...]
+    consume: tuple[Arcs, ...]
+    produce: tuple[Arcs, ...]
+    inhibit: tuple[Arcs, ...]
+    initial: Marking
+    capacity: tuple[int | None, ...]
+    priority: tuple[int, ...]
+    place_index: Mapping[str, int] = field(init=False, repr=False, compare=False)
+    transition_index: Mapping[str, int] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Refuse a malformed net with one clear ValueError."""
+        for what, names in (("place", self.places), ("transition", self.transitions)):
+            if len(set(names)) != len(names):
+                twice = sorted({n for n in names if names.count(n) > 1})
+                raise ValueError(f"{what} named twice: {', '.join(twice)}")
+        n, m = len(self.places), len(self.transitions)
+        if not len(self.initial) == len(self.capacity) == n:
+            raise ValueError("initial marking and capacities need one entry for each place")
+        if not len(self.consume) == len(self.produce) == len(self.inhibit) == len(self.priority) == m:
+            raise ValueError("arcs and priorities need one entry for each transition")
+        for arcs in (*self.consume, *self.produce, *self.inhibit):
+            if any(not 0 <= p < n or w < 1 for p, w in arcs) or len({p for p, _ in arcs}) != len(arcs):
+                raise ValueError("an arc names an unknown place, names it twice or has a weight below 1")
+        object.__setattr__(self, "place_index", {p: i for i, p in enumerate(self.places)})
+        object.__setattr__(self, "transition_index", {t: i for i, t in enumerate(self.transitions)})
+
+    @classmethod
+    def build(
+        cls,
+        places: Mapping[str, int],
+        transitions: Mapping[str, tuple[Mapping[str, int], Mapping[str, int]]],
+        *,
+        inhibitors: Mapping[str, Mapping[str, int]] | None = None,
+        capacity: Mapping[str, int] | None = None,
+        priority: Mapping[str, int] | None = None,
+    ) -> Net:
+        """A net from names: initial tokens by place, and (consumed, produced) weights by place for each transition."""
+        index = {p: i for i, p in enumerate(places)}
+        inhibitors, capacity, priority = inhibitors or {}, capacity or {}, priority or {}
+
+        def arcs(weights: Mapping[str, int]) -> Arcs:
+            unknown = [p for p in weights if p not in index]
+            if unknown:
+                raise ValueError(f"an arc names the unknown place {unknown[0]!r}")
+            return tuple(sorted((index[p], w) for p, w in weights.items()))
+
+        return cls(
+            tuple(places),
+            tuple(transitions),
+            tuple(arcs(pre) for pre, _ in transitions.values()),
+            tuple(arcs(post) for _, post in transitions.values()),
+            tuple(arcs(inhibitors.get(t, {})) for t in transitions),
+            tuple(places.values()),
+            tuple(capacity.get(p) for p in places),
+            tuple(priority.get(t, 0) for t in transitions),
+        )
+
+    def has_concession(self, marking: Marking, t: int) -> bool:
+        """Whether tokens, inhibitors and capacities allow transition t, priorities aside."""
+        if any(marking[p] < w for p, w in self.consume[t]) or any(marking[p] >= k for p, k in self.inhibit[t]):
+            return False
+        return not any(
+            limit is not None and marking[p] + w - self._weight(self.consume[t], p) > limit
+            for p, w in self.produce[t]
+            if (limit := self.capacity[p]) is not None
+        )
+
+    def is_enabled(self, marking: Marking, t: int) -> bool:
+        """Whether transition t may fire in the marking."""
+        return self.has_concession(marking, t) and not any(
+            self.priority[u] > self.priority[t] and self.has_concession(marking, u)
+            for u in range(len(self.transitions))
+        )
+
+    def enabled(self, marking: Marking) -> list[int]:
+        """All transitions that may fire in the marking, in transition order."""
+        able = [t for t in range(len(self.transitions)) if self.has_concession(marking, t)]
+        top = max((self.priority[t] for t in able), default=0)
+        return [t for t in able if self.priority[t] == top]
+
+    def fire(self, marking: Marking, t: int) -> Marking:
+        """The marking after transition t. Raises NotEnabled."""
+        if not self.is_enabled(marking, t):
+            raise NotEnabled(f"{self.transitions[t]} is not enabled in {self.describe(marking)}")
+        after = list(marking)
+        for p, w in self.consume[t]:
+            after[p] -= w
+        for p, w in self.produce[t]:
+            after[p] += w
+        return tuple(after)
+
+    def replay(self, firings: Iterable[str], marking: Marking | None = None) -> Iterator[Marking]:
+        """The markings along a firing sequence of transition names, starting with the given or initial one."""
+        current = self.initial if marking is None else marking
+        yield current
+        for name in firings:
+            current = self.fire(current, self.transition_index[name])
+            yield current
+
+    def describe(self, marking: Marking) -> str:
+        """The marking for people: marked places with their tokens."""
+        return (
+            " ".join(f"{p}:{n}" if n != 1 else p for p, n in zip(self.places, marking, strict=True) if n) or "(empty)"
+        )
+
+    @staticmethod
+    def _weight(arcs: Arcs, place: int) -> int:
+        return next((w for p, w in arcs if p == place), 0)

@@ -1,0 +1,1 @@
+"""What a host runs: nodes that offer primitive actions and services."""

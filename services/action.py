@@ -1,0 +1,132 @@
+"""How a primitive action is written: status, result, and the context through which alone it touches the world.
+
+An action is a callable named by import path (`module:function`). Its first parameter is the context, all others are
+keyword parameters of plain data. `def` actions compute and return; `async def` actions may also wait, but only through
+their context, so the same code runs in a warm worker process on the wall clock and inline in a lock-step cell.
+
+    async def locate(ctx: Context, *, timeout: float = 5.0) -> Result:
+        image = await ctx.device.read(timeout)
+        if image is None:
+            return error("no_image", "the camera sent nothing")
+        return success(point=[1.0, 0.2, 0.6])
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, Protocol
+
+Plain = None | bool | int | float | str | bytes | Sequence["Plain"] | Mapping[str, "Plain"]
+
+
+class Status(StrEnum):
+    """How a run ended (paper, section 4)."""
+
+    SUCCESS = "success"
+    """The specification was fully met."""
+    FAILURE = "failure"
+    """The specification was not fully met, but the task may go on along its normal branch."""
+    ERROR = "error"
+    """The specification was not met and error recovery is required."""
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What an action returns: its status, what it writes, and why when it is not SUCCESS.
+
+    `values` are plain data; the task file's `out` says which of them go to which variable. `cause` is a short code
+    that programs compare (`"ball_lost"`), `text` is for people.
+    """
+
+    status: Status
+    values: Mapping[str, Any] = field(default_factory=dict)
+    cause: str = ""
+    text: str = ""
+
+
+def success(**values: Any) -> Result:
+    """The specification was fully met."""
+    return Result(Status.SUCCESS, values)
+
+
+def failure(cause: str, text: str = "", **values: Any) -> Result:
+    """The specification was not fully met; the task goes on along its normal branch."""
+    return Result(Status.FAILURE, values, cause, text)
+
+
+def error(cause: str, text: str = "", **values: Any) -> Result:
+    """The specification was not met; the task goes on along its error branch."""
+    return Result(Status.ERROR, values, cause, text)
+
+
+class Cancelled(BaseException):
+    """Thrown into an action at its current wait when its run is cancelled; clean up and let it pass."""
+
+
+class Wait:
+    """What an action's coroutine yields: go on when `ready()` holds or when the clock reaches `due` (s; None: never).
+
+    Awaiting it gives True if it was ready, False if its time was over.
+    """
+
+    __slots__ = ("due", "ready")
+
+    def __init__(self, ready: Callable[[], bool], due: float | None = None) -> None:
+        self.ready = ready
+        self.due = due
+
+    def __await__(self) -> Generator[Wait, None, bool]:
+        yield self
+        return self.ready()
+
+
+class Context(Protocol):
+    """What a run may use besides its arguments. Times are seconds on the cell's clock; durations cross the wire, times never."""
+
+    @property
+    def now(self) -> float:
+        """The cell's clock: simulated time in lock step, monotonic time otherwise (s)."""
+
+    @property
+    def run(self) -> str:
+        """This run's id."""
+
+    @property
+    def device(self) -> Any:
+        """The handle of the action's device: its driver, or a `Remote` of it when the driver is cyclic; None without a device."""
+
+    def wait(self, ready: Callable[[], bool], timeout: float | None = None) -> Wait:
+        """Awaitable: True as soon as `ready()` holds, False after `timeout` seconds."""
+
+    def sleep(self, seconds: float) -> Wait:
+        """Awaitable: goes on after so many seconds of the cell's clock."""
+
+    def publish(self, stream: str, values: Sequence[float]) -> None:
+        """Send newest set point to a stream; whoever receives it sees only the newest. Repeated by the sender while the run
+        goes on and stands by it."""
+
+    def withdraw(self, stream: str) -> None:
+        """Stop standing by the last set point of a stream; its receiver holds after three periods."""
+
+    def raise_event(self, name: str, **data: Any) -> None:
+        """Raise a named internal event while the run goes on."""
+
+    def progress(self, fraction: float, **data: Any) -> None:
+        """Tell the coordinator how far the run is, 0 to 1, with plain data for people to look at."""
+
+    async def call(self, service: str, /, deadline: float | None = None, **arguments: Any) -> Result:
+        """Call any network service by its name, wherever it is."""
+
+    async def get(self, name: str) -> Any:
+        """Read a global-memory variable (None if it was never written)."""
+
+    async def put(self, name: str, value: Any) -> int:
+        """Write a global-memory variable; gives its new version."""
+
+    async def compare_and_set(self, name: str, version: int, value: Any) -> bool:
+        """Write a global-memory variable if its version is still the given one."""
+
+    def random(self, purpose: str) -> Any:
+        """A numpy Generator keyed by (seed, run, purpose): the same draws on every host."""

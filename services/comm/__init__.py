@@ -1,0 +1,1 @@
+"""All that two processes must agree on."""

@@ -1,0 +1,26 @@
+"""A CAN bus as drivers and simulated drives see it: frames out, frames in, nothing blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+
+class Frame(NamedTuple):
+    """A classic CAN data frame: 11-bit identifier and at most 8 bytes (ISO 11898-1)."""
+
+    id: int
+    data: bytes
+
+
+class CanBus(Protocol):
+    """One port on a bus; a port does not hear itself."""
+
+    def send(self, frame: Frame) -> None:
+        """Put a frame on the bus. Raises ConnectionError when the bus is gone."""
+
+    def receive(self) -> Sequence[Frame]:
+        """All frames that arrived since the last call, oldest first. Raises ConnectionError when the bus is gone."""
+
+    def close(self) -> None:
+        """Leave the bus."""

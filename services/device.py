@@ -1,0 +1,108 @@
+"""How a device driver is written: what owns a camera, an arm or a rover on its node.
+
+A driver is a class named by import path in services.toml (`[devices.NAME] driver = "module:Class"`), constructed as
+`Class(config, ports)`. One without a `period` lives in the worker process of its device, and actions use it directly as
+`ctx.device`. One with a `period` is *cyclic*: in real time it lives in a process of its own, paced by absolute deadline,
+so no user code delays it; actions see a `Remote` of it: `send` a command, read `state`. In lock step both live inline.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+from services.comm.canbus import CanBus
+from services.comm.image import ImageSource
+
+
+class Setpoint(Protocol):
+    """The receiving end of a set-point stream: the newest value and how old it is."""
+
+    @property
+    def values(self) -> tuple[float, ...] | None:
+        """The newest set point, None before the first or when it is stale (older than three of its periods)."""
+
+    @property
+    def age(self) -> float:
+        """Seconds since the newest one arrived (inf before the first)."""
+
+    @property
+    def count(self) -> int:
+        """How many have arrived."""
+
+
+class Ports(Protocol):
+    """What a driver may reach: everything else is out of bounds for it."""
+
+    @property
+    def now(self) -> float:
+        """The cell's clock (s)."""
+
+    def can(self) -> CanBus:
+        """The CAN bus of this device."""
+
+    def images(self) -> ImageSource:
+        """The image source of this device."""
+
+    def stream(self, name: str) -> Setpoint:
+        """The receiving end of a set-point stream."""
+
+    def raise_event(self, name: str, **data: Any) -> None:
+        """Raise an external event (numbered and kept until the coordinator has it)."""
+
+    def file(self, path: str) -> bytes:
+        """A file named in services.toml, relative to it."""
+
+
+class Driver(Protocol):
+    """One device. Nothing here blocks; `now` is the cell's clock (s)."""
+
+    period: float | None
+    """Seconds between calls of `step`; None for a driver without cyclic duty."""
+
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        """Take a command from an action (cyclic drivers). A bad one raises ValueError."""
+
+    def step(self, now: float) -> None:
+        """One cycle (cyclic drivers)."""
+
+    def state(self) -> Mapping[str, Any]:
+        """Plain data for actions, operator and report, published each cycle."""
+
+    def stop(self, now: float) -> None:
+        """Stop routine: bring the device to a safe standstill. May be called at any time and again."""
+
+    def stopped(self) -> bool:
+        """Whether the device is known to stand still."""
+
+    def hold(self, now: float) -> str:
+        """Operator's pause: answers "held", "cannot hold" or "stopped"."""
+
+    def release(self, now: float) -> None:
+        """End of the operator's pause."""
+
+    def close(self) -> None:
+        """Let the device go."""
+
+
+class Remote(Protocol):
+    """A cyclic driver as its actions see it."""
+
+    def send(self, body: Mapping[str, Any]) -> int:
+        """Send a command; gives its number, which `handled` reaches once the driver has taken it."""
+
+    @property
+    def handled(self) -> int:
+        """Number of the last command that the driver has taken."""
+
+    @property
+    def refused(self) -> str:
+        """Why the last command was refused; empty if it was not."""
+
+    @property
+    def state(self) -> Mapping[str, Any]:
+        """The driver's newest published state."""
+
+    @property
+    def age(self) -> float:
+        """Seconds since that state was published."""

@@ -1,0 +1,1 @@
+"""The vision node's actions: calibrate, locate, track and predict."""
