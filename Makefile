@@ -1,0 +1,42 @@
+# One command per verb. `make demo` and `make test` set up all they need by themselves.
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV := .venv
+BIN := $(VENV)/bin
+RUNS ?= 4
+
+.PHONY: help demo test proof lint bench clean
+
+help:
+	@echo "make demo   set up, start the cell's nodes, catch $(RUNS) balls in real time, leave a report"
+	@echo "make test   set up, check style and types, run the tests (under 10 minutes)"
+	@echo "make proof  check every promised figure in full (hours; resumes where it stopped)"
+	@echo "make bench  measure speed beside others, as ratios"
+	@echo "make clean  remove the environment and all that was made"
+
+$(VENV)/.ready: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || \
+	  { echo "petrobot needs CPython 3.11 (pybullet has no later wheels): set PYTHON=/path/to/python3.11"; exit 2; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[test]"
+	@touch $@
+
+demo: $(VENV)/.ready
+	$(BIN)/petrobot run catch_ball --up --runs $(RUNS) --report reports/demo
+
+lint: $(VENV)/.ready
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy coordinator services sim tests
+
+test: lint
+	$(BIN)/pytest -n 2 -m "not proof"
+
+proof: $(VENV)/.ready
+	$(BIN)/python -m tests.proof
+
+bench: $(VENV)/.ready
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[test,bench]"
+	$(BIN)/python tests/bench/wire.py
+
+clean:
+	rm -rf $(VENV) build *.egg-info reports runs .mypy_cache .ruff_cache .pytest_cache .hypothesis
