@@ -37,6 +37,7 @@ class Hello:
     directory: str = ""
     """Hash of the sender's services.toml."""
     auth: bytes = b""
+    """The sender's nonce when the link has a key, else empty."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +54,7 @@ class Welcome:
     """Ids of calls still going on, or ended and not acknowledged yet, of this caller's name."""
     directory: str = ""
     auth: bytes = b""
+    """Proof that the server knows the key when the link has one, else empty."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +125,8 @@ class ResultAck:
 
     KIND: ClassVar[int] = 8
     id: str
+    more: tuple[str, ...] = ()
+    """Ids of further results acknowledged with it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,6 +223,54 @@ class Bye:
     text: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class Challenge:
+    """Answer of a server with a key to Hello: its nonce."""
+
+    KIND: ClassVar[int] = 19
+    auth: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Proof:
+    """Answer to Challenge: the client knows the key."""
+
+    KIND: ClassVar[int] = 20
+    auth: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class StreamOpen:
+    """First message on a stream's own connection: set points of this stream follow, one each `period` seconds."""
+
+    KIND: ClassVar[int] = 21
+    stream: str
+    period: float
+    ticket: str = ""
+    """What the receiving node gave out for this stream; a receiver that asks for none ignores it."""
+
+
+@dataclass(frozen=True, slots=True)
+class SetPoint:
+    """The newest set point of a stream, repeated each period while its sender stands by it."""
+
+    KIND: ClassVar[int] = 22
+    number: int
+    """Counts up from 1 with each message of the stream."""
+    values: tuple[float, ...]
+    held: float = 0.0
+    """Seconds that the sender has stood by these values already: 0 when they are new."""
+    elapsed: float = 0.0
+    """Seconds since the stream was opened, on the sender's clock: tells the receiver what was late on its way."""
+
+
+@dataclass(frozen=True, slots=True)
+class Withdraw:
+    """The sender stands by its last set point no more."""
+
+    KIND: ClassVar[int] = 23
+
+
 Message = (
     Hello
     | Welcome
@@ -238,4 +290,9 @@ Message = (
     | Pong
     | Tick
     | Bye
+    | Challenge
+    | Proof
+    | StreamOpen
+    | SetPoint
+    | Withdraw
 )
