@@ -1,0 +1,7 @@
+"""`python -m coordinator` is the `petrobot` command."""
+
+import sys
+
+from coordinator.cli import main
+
+sys.exit(main())

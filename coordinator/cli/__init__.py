@@ -1,0 +1,102 @@
+"""The `petrobot` command: finds the sub-command, runs it, and turns every fault into one clear line and an exit code."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+
+EXIT_CODES = """\
+exit codes: 0 the task reached its final marking (or the command did its work), 1 it ended in ERROR or was aborted,
+            2 bad input, 3 a node is unreachable, 130 interrupted"""
+
+
+class CommandError(Exception):
+    """A command cannot go on: what to print and the exit code."""
+
+    def __init__(self, code: int, text: str) -> None:
+        super().__init__(text)
+        self.code = code
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """One sub-command; its module is imported only when it is used, so that quick commands stay quick."""
+
+    name: str
+    summary: str
+
+
+COMMANDS = (
+    Command("run", "run a task"),
+    Command("check", "check a task before it runs"),
+    Command("show", "draw a task as SVG"),
+    Command("up", "launch the nodes that services.toml places on this host"),
+    Command("nodes", "who is up, and what it offers"),
+    Command("node", "launch one node"),
+    Command("sim", "launch the simulated laboratory"),
+    Command("calibrate", "calibrate a camera from images of a board"),
+    Command("new", "write the skeleton of an action or a task"),
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; gives the exit code."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if arguments[:1] == ["--version"]:
+        print(f"petrobot {version('petrobot')}")
+        return 0
+    known = {command.name: command for command in COMMANDS}
+    if not arguments or arguments[0] not in known:
+        return _overview(arguments)
+    return _dispatch(known[arguments[0]], arguments[1:])
+
+
+def _overview(arguments: Sequence[str]) -> int:
+    width = max(len(command.name) for command in COMMANDS) + 2
+    lines = [f"  {command.name:{width}}{command.summary}" for command in COMMANDS]
+    text = "\n".join(
+        [
+            "usage: petrobot COMMAND ...   (petrobot COMMAND --help shows its options and an example)",
+            "",
+            "coordinates real robots with Petri nets: a task is one net, its actions run on the nodes of services.toml",
+            "",
+            *lines,
+            "",
+            EXIT_CODES,
+        ]
+    )
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(text)
+        return 0
+    print(f"petrobot: no command {arguments[0]!r}\n\n{text}", file=sys.stderr)
+    return 2
+
+
+def _dispatch(command: Command, arguments: Sequence[str]) -> int:
+    module = importlib.import_module(f"coordinator.cli.{command.name}")
+    parser = argparse.ArgumentParser(
+        prog=f"petrobot {command.name}",
+        description=module.__doc__,
+        epilog=f"example:\n  {module.EXAMPLE}\n\n{EXIT_CODES}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    module.add_arguments(parser)
+    try:
+        options = parser.parse_args(arguments)
+    except SystemExit as leaving:
+        return int(leaving.code or 0)
+    try:
+        return int(module.run(options))
+    except CommandError as fault:
+        print(f"petrobot {command.name}: {fault}", file=sys.stderr)
+        return fault.code
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        sys.stderr.close()  # the reader went away; Python would complain once more at exit
+        return 1

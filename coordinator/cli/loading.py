@@ -1,0 +1,87 @@
+"""How commands find their files: the task, services.toml, and where results go."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from coordinator.cli import CommandError
+
+if TYPE_CHECKING:
+    import argparse
+
+    from coordinator.task import Task
+    from services.comm.directory import Directory
+
+SHIPPED = Path(__file__).parents[1] / "tasks"
+"""Tasks that come with petrobot; they are known by their bare names."""
+
+
+def add_services_argument(parser: argparse.ArgumentParser) -> None:
+    """`--services FILE`, the same for all commands."""
+    parser.add_argument(
+        "--services",
+        metavar="FILE",
+        type=Path,
+        help="the location file (default: services.toml here, else the one that comes with petrobot)",
+    )
+
+
+def task_path(name: str) -> Path:
+    """The file of a task given by path or by the bare name of a shipped one."""
+    path = Path(name)
+    if path.suffix == ".toml" or path.exists():
+        return path
+    shipped = SHIPPED / f"{name}.toml"
+    if shipped.exists():
+        return shipped
+    known = ", ".join(sorted(p.stem for p in SHIPPED.glob("*.toml")))
+    raise CommandError(2, f"no task {name!r}: give a .toml file, or one of those that come with petrobot: {known}")
+
+
+def load_task(name: str) -> Task:
+    """Read a task file."""
+    from coordinator.taskfile import TaskFileError, load
+
+    path = task_path(name)
+    try:
+        return load(path)
+    except OSError as fault:
+        raise CommandError(2, f"{path}: {fault.strerror or fault}") from fault
+    except TaskFileError as fault:
+        raise CommandError(2, str(fault)) from fault
+
+
+def services_path(given: Path | None) -> Path:
+    """services.toml: the given one, the one here, or the shipped one."""
+    if given is not None:
+        return given
+    here = Path("services.toml")
+    return here if here.exists() else Path(__file__).parents[2] / "services.toml"
+
+
+def load_directory(given: Path | None) -> Directory:
+    """Read services.toml."""
+    from services.comm.directory import DirectoryError, load
+
+    path = services_path(given)
+    try:
+        return load(path)
+    except OSError as fault:
+        raise CommandError(2, f"{path}: {fault.strerror or fault}") from fault
+    except DirectoryError as fault:
+        raise CommandError(2, str(fault)) from fault
+
+
+def write_json(path: str, data: Any) -> None:
+    """Write results as JSON; `-` is standard output."""
+    text = json.dumps(data, indent=2, ensure_ascii=False) + "\n"
+    if path == "-":
+        print(text, end="")
+        return
+    try:
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        Path(path).write_text(text, encoding="utf-8")
+    except OSError as fault:
+        raise CommandError(2, f"{path}: {fault.strerror or fault}; give --json a file that can be written") from fault

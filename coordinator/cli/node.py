@@ -1,0 +1,24 @@
+"""Launch one node of services.toml on this host (the same as python -m services NAME)."""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+
+from coordinator.cli.loading import add_services_argument, services_path
+
+EXAMPLE = "petrobot node vision --services services.toml"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument("name", help="the node's name in services.toml")
+    add_services_argument(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Become the node."""
+    return subprocess.call(
+        [sys.executable, "-m", "services", options.name, "--services", str(services_path(options.services))]
+    )

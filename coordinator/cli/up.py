@@ -1,0 +1,52 @@
+"""Launch the nodes that services.toml places on this host, and keep them alive until Ctrl-C."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import signal
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from coordinator.cli import CommandError
+from coordinator.cli.loading import add_services_argument, load_directory
+
+if TYPE_CHECKING:
+    from services.comm.directory import Directory
+
+EXAMPLE = "petrobot up --services services.toml"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    add_services_argument(parser)
+    parser.add_argument("--logs", type=Path, default=Path("runs/logs"), help="folder of the nodes' logs (%(default)s)")
+    parser.add_argument("--no-respawn", action="store_true", help="leave a node that died dead")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Launch and watch."""
+    return asyncio.run(_up(load_directory(options.services), options))
+
+
+async def _up(directory: Directory, options: argparse.Namespace) -> int:
+    from coordinator.launch import local_programs
+    from coordinator.supervisor import LaunchError, Supervisor
+
+    programs = local_programs(directory)
+    if not programs:
+        raise CommandError(2, f"{directory.source}: none of its nodes has an address of this host")
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    supervisor = Supervisor(programs, options.logs, respawn=not options.no_respawn, notice=print)
+    try:
+        async with supervisor:
+            for name, process in supervisor.process_ids().items():
+                node = directory.nodes[name]
+                print(f"{name:12} ready on {node.host}:{node.port} (process {process})", flush=True)
+            print("Ctrl-C stops them all", flush=True)
+            await stop.wait()
+    except LaunchError as fault:
+        raise CommandError(3, str(fault)) from fault
+    return 0

@@ -1,0 +1,175 @@
+"""Launches the node processes of this host, watches them, and starts dead ones again with a growing pause."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ctypes
+import signal
+import socket
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+PR_SET_PDEATHSIG = 1  # prctl(2): a child ends with its parent, also when that is killed
+FIRST_PAUSE = 0.25
+LONGEST_PAUSE = 8.0
+STABLE_AFTER = 10.0  # a node that ran so long (s) starts again without pause
+
+
+class LaunchError(Exception):
+    """A node did not come up: which, and what it printed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Program:
+    """One process to keep alive: its name and command line."""
+
+    name: str
+    command: Sequence[str]
+
+
+@dataclass
+class _Child:
+    program: Program
+    log: Path
+    ready: asyncio.Event = field(default_factory=asyncio.Event)
+    process: asyncio.subprocess.Process | None = None
+    starts: int = 0
+    task: asyncio.Task[None] | None = None
+
+
+def is_local(host: str) -> bool:
+    """Whether an address belongs to this host: only then can a socket be bound to it."""
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.bind(address)
+    except OSError:
+        return False
+    return True
+
+
+def _end_with_parent() -> None:
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+class Supervisor:
+    """Keeps programs alive. Each writes to its own log and says `ready` in the first line that it prints."""
+
+    def __init__(
+        self,
+        programs: Sequence[Program],
+        logs: Path,
+        *,
+        respawn: bool = True,
+        notice: Callable[[str], None] | None = None,
+    ) -> None:
+        logs.mkdir(parents=True, exist_ok=True)
+        self._children = [_Child(program, logs / f"{program.name}.log") for program in programs]
+        self._respawn = respawn
+        self._notice = notice or (lambda _: None)
+        self._stopping = False
+
+    async def __aenter__(self) -> Supervisor:
+        """Start all programs; raises LaunchError when one does not get ready within 30 s."""
+        try:
+            await self.start()
+        except BaseException:
+            await self.stop()
+            raise
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Stop them all."""
+        await self.stop()
+
+    async def start(self, timeout: float = 30.0) -> None:
+        """Start all programs and wait until each is ready."""
+        for child in self._children:
+            child.task = asyncio.create_task(self._keep(child), name=f"keep {child.program.name}")
+        for child in self._children:
+            await self._until_ready(child, timeout)
+
+    async def stop(self) -> None:
+        """Ask all to end, and kill those that do not within 5 s."""
+        self._stopping = True
+        for child in self._children:
+            _signal(child, signal.SIGTERM)
+        waiting = [child.task for child in self._children if child.task]
+        if not waiting:
+            return
+        _, late = await asyncio.wait(waiting, timeout=5.0)
+        for child in self._children:
+            if child.task in late:
+                _signal(child, signal.SIGKILL)
+        await asyncio.gather(*waiting, return_exceptions=True)
+
+    def process_ids(self) -> dict[str, int]:
+        """Process id of each running program by name."""
+        return {c.program.name: c.process.pid for c in self._children if c.process and c.process.returncode is None}
+
+    def starts(self, name: str) -> int:
+        """How often a program has been started."""
+        return next(c.starts for c in self._children if c.program.name == name)
+
+    async def _until_ready(self, child: _Child, timeout: float) -> None:
+        ready = asyncio.create_task(child.ready.wait())
+        assert child.task is not None
+        done, _ = await asyncio.wait({ready, child.task}, timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
+        if ready in done:
+            return
+        ready.cancel()
+        tail = "\n".join(child.log.read_text(errors="replace").splitlines()[-12:]) if child.log.exists() else ""
+        why = "ended" if child.task in done else f"was not ready after {timeout:g} s"
+        raise LaunchError(f"node {child.program.name} {why}; its log {child.log} ends with:\n{tail}")
+
+    async def _keep(self, child: _Child) -> None:
+        loop, pause = asyncio.get_running_loop(), FIRST_PAUSE
+        while not self._stopping:
+            started = loop.time()
+            await self._run_once(child)
+            if self._stopping or not self._respawn or not child.ready.is_set():
+                return
+            pause = FIRST_PAUSE if loop.time() - started > STABLE_AFTER else min(2 * pause, LONGEST_PAUSE)
+            self._notice(f"node {child.program.name} died; starting it again in {pause:g} s")
+            await asyncio.sleep(pause)
+
+    async def _run_once(self, child: _Child) -> None:
+        with child.log.open("ab") as log:
+            process = await asyncio.create_subprocess_exec(
+                *child.program.command,
+                stdin=asyncio.subprocess.DEVNULL,
+                stdout=asyncio.subprocess.PIPE,
+                stderr=log,
+                preexec_fn=_end_with_parent,
+            )
+            child.process, child.starts = process, child.starts + 1
+            if self._stopping:
+                _signal(child, signal.SIGTERM)
+            assert process.stdout is not None
+            async for line in process.stdout:
+                log.write(line)
+                log.flush()
+                if b"ready" in line:
+                    child.ready.set()
+            await process.wait()
+
+
+def _signal(child: _Child, number: signal.Signals) -> None:
+    if child.process and child.process.returncode is None:
+        with contextlib.suppress(ProcessLookupError):
+            child.process.send_signal(number)
+
+
+def node_program(name: str, services: Path, *, lockstep: bool = False) -> Program:
+    """The command line that launches a node."""
+    mode = ["--lockstep"] if lockstep else []
+    return Program(name, [sys.executable, "-m", "services", name, "--services", str(services), *mode])
+
+
+def laboratory_program(name: str, services: Path, *, lockstep: bool = False) -> Program:
+    """The command line that launches the simulated laboratory."""
+    mode = ["--lockstep"] if lockstep else []
+    return Program(name, [sys.executable, "-m", "sim", "--services", str(services), *mode])
