@@ -1,0 +1,330 @@
+"""The simulated camera: a pinhole with lens distortion looks at the cell and gives grey images as a real one would.
+
+The static scene is drawn once; each image copies it, paints ball, shadow, arm and cup into their regions of interest and
+adds light and noise in one pass. Geometry: pinhole with the distortion of Brown (1966) in OpenCV's order k1 k2 p1 p2;
+the ball is an exact sphere (its distance from each pixel's ray), blurred over the exposure.
+Lengths in m, base frame; pixels are (u, v), u to the right, whole numbers at pixel centres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sim.scenery import Chessboard, Table, floor_grey, supersampled
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+
+BALL_GREY = 215.0
+ARM_GREY = 120.0
+CUP_GREY = 92.0
+CUP_INSIDE_GREY = 40.0
+CUP_WALL = 0.004
+SHADOW_DEPTH = 0.35
+"""Part of the light that the ball takes from the table right below it."""
+NOISE_ZERO = 128
+NOISE_SIZE = 1280
+LIGHT_DIRECTION = np.array([-0.25, 0.35, 0.90]) / np.linalg.norm([-0.25, 0.35, 0.90])
+"""Towards the lamp, base frame."""
+LENS_STEPS = 12
+CIRCLE = np.stack([f(np.linspace(0.0, 2.0 * np.pi, 13)[:-1]) for f in (np.cos, np.sin)], axis=-1)
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """The true camera and light, where they differ from the cell's nominal ones. None: nominal."""
+
+    position: Sequence[float] | None = None
+    """(3,) optical centre, m, base frame."""
+    rotation: ArrayLike | None = None
+    """(3, 3), rows are the camera's x (right), y (down) and z (forward) axes in the base frame."""
+    focal_px: float | None = None
+    principal_px: Sequence[float] | None = None
+    """(2,) px; nominal is the middle of the image."""
+    distortion: Sequence[float] | None = None
+    """k1 k2 p1 p2."""
+    table_top: float | None = None
+    """m."""
+    near_edge: float | None = None
+    """m."""
+    light_gradient: Sequence[float] = (-0.30, 0.10)
+    """Relative change of the light from one side of the image to the other, along u and v: the far end is dimmer."""
+    vignetting: float = 0.20
+    """Relative loss of light in the image's corners."""
+    noise: float | None = None
+    """Grey levels, sigma."""
+
+    @classmethod
+    def of(cls, truth: Mapping[str, Any]) -> View:
+        """Read from a mapping with these names as keys. An unknown key raises ValueError."""
+        unknown = sorted(set(truth) - set(cls.__slots__))
+        if unknown:
+            raise ValueError(f"camera truth: unknown key {unknown[0]!r}; known are {', '.join(cls.__slots__)}")
+        return cls(**truth)
+
+
+class PinholeCamera:
+    """The camera of the simulated laboratory. The same generator state and the same calls give the same images."""
+
+    def __init__(self, cell: Mapping[str, Any], truth: Mapping[str, Any], rng: np.random.Generator) -> None:
+        camera, view = cell["camera"], View.of(truth)
+        self.view = view
+        self.width, self.height = int(camera["width"]), int(camera["height"])
+        self.table = Table.of(cell, view.table_top, view.near_edge)
+        self.ball_radius = float(cell["ball"]["radius"])
+        self.cup_radius, self.cup_depth = float(cell["cup"]["radius"]), float(cell["cup"]["depth"])
+        self.exposure = float(camera["exposure"])
+        self.focal = float(camera["focal_px"] if view.focal_px is None else view.focal_px)
+        middle = ((self.width - 1) / 2, (self.height - 1) / 2)
+        self.cx, self.cy = (float(c) for c in (middle if view.principal_px is None else view.principal_px))
+        self.distortion: Array = np.asarray(camera["distortion"] if view.distortion is None else view.distortion, float)
+        self.position: Array = np.asarray(camera["position"] if view.position is None else view.position, float)
+        self.rotation: Array = _looking_down(camera) if view.rotation is None else np.asarray(view.rotation, float)
+        self._rng = rng
+        sigma = float(camera["noise"] if view.noise is None else view.noise)
+        field = NOISE_ZERO + sigma * rng.standard_normal((NOISE_SIZE, NOISE_SIZE), np.float32)
+        self._noise: Picture = np.clip(np.rint(field), 0, 255).astype(np.uint8)
+
+    # Geometry
+
+    def to_camera(self, points: ArrayLike) -> Array:
+        """Base-frame points (..., 3) in the camera's frame."""
+        return np.asarray((np.asarray(points, float) - self.position) @ self.rotation.T)
+
+    def project(self, points: ArrayLike) -> Array:
+        """Pixels (..., 2) of base-frame points (..., 3)."""
+        seen = self.to_camera(points)
+        x, y = seen[..., 0] / seen[..., 2], seen[..., 1] / seen[..., 2]
+        k1, k2, p1, p2 = self.distortion
+        square = x * x + y * y
+        radial = 1.0 + square * (k1 + k2 * square)
+        u = x * radial + 2.0 * p1 * x * y + p2 * (square + 2.0 * x * x)
+        v = y * radial + p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y
+        return np.stack([self.focal * u + self.cx, self.focal * v + self.cy], axis=-1)
+
+    def rays(self, pixels: Array) -> Array:
+        """Unit directions (..., 3), camera frame, in which pixels (..., 2) look; fixed-point inverse of the distortion."""
+        du = (pixels[..., 0] - self.cx) / self.focal
+        dv = (pixels[..., 1] - self.cy) / self.focal
+        x, y = du, dv
+        k1, k2, p1, p2 = self.distortion
+        for _ in range(LENS_STEPS):
+            square = x * x + y * y
+            radial = 1.0 + square * (k1 + k2 * square)
+            x, y = (
+                (du - 2.0 * p1 * x * y - p2 * (square + 2.0 * x * x)) / radial,
+                (dv - p1 * (square + 2.0 * y * y) - 2.0 * p2 * x * y) / radial,
+            )
+        direction = np.stack([x, y, np.ones_like(x)], axis=-1)
+        return np.asarray(direction / np.linalg.norm(direction, axis=-1, keepdims=True))
+
+    def _on_plane(self, pixels: Array, origin: Array, normal: Array) -> Array:
+        """Base-frame points (..., 3) where pixels look through a plane."""
+        direction = self.rays(pixels) @ self.rotation
+        distance = ((origin - self.position) @ normal) / (direction @ normal)
+        return np.asarray(self.position + distance[..., None] * direction)
+
+    # Static scene
+
+    @cached_property
+    def _grid(self) -> Array:
+        u, v = np.meshgrid(np.arange(self.width, dtype=float), np.arange(self.height, dtype=float))
+        return np.stack([u, v], axis=-1)
+
+    @cached_property
+    def _rays(self) -> NDArray[np.float32]:
+        return self.rays(self._grid).astype(np.float32)
+
+    @cached_property
+    def illumination(self) -> NDArray[np.float32]:
+        """Relative light (height, width): gradient and vignetting."""
+        u = (self._grid[..., 0] - (self.width - 1) / 2) / self.width
+        v = (self._grid[..., 1] - (self.height - 1) / 2) / self.height
+        gradient = 1.0 + self.view.light_gradient[0] * u + self.view.light_gradient[1] * v
+        return (gradient * (1.0 - self.view.vignetting * 2.0 * (u * u + v * v))).astype(np.float32)
+
+    def _scene_grey(self, pixels: Array) -> Array:
+        up = np.array([0.0, 0.0, 1.0])
+        table = self._on_plane(pixels, np.array([0.0, 0.0, self.table.top]), up)
+        floor = self._on_plane(pixels, np.zeros(3), up)
+        on_table = self.table.contains(table[..., 0], table[..., 1])
+        return np.where(
+            on_table, self.table.grey(table[..., 0], table[..., 1]), floor_grey(floor[..., 0], floor[..., 1])
+        )
+
+    @cached_property
+    def background(self) -> Picture:
+        """The scene without ball, arm and cup, lit, without noise (height, width)."""
+        grey = supersampled(self._grid, self._scene_grey, 3) * self.illumination
+        return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+
+    # Images
+
+    def render(
+        self,
+        ball: ArrayLike | None,
+        ball_velocity: ArrayLike = (0.0, 0.0, 0.0),
+        arm_points: ArrayLike | None = None,
+        arm_radii: ArrayLike = (),
+        cup_pose: ArrayLike | None = None,
+        light: float = 1.0,
+    ) -> Picture:
+        """One image (height, width) uint8.
+
+        ball: centre at mid-exposure (3,) m, None: no ball; ball_velocity (3,) m/s; arm_points (n, 2, 3): both ends of each
+        capsule of the arm, arm_radii (n,) m; cup_pose (4, 4): the cup's mouth centre with z out of the mouth; light: factor.
+        """
+        picture = self.background.copy()
+        capsules = (
+            [] if arm_points is None else list(zip(np.asarray(arm_points, float), np.ravel(arm_radii), strict=True))
+        )
+        pose = None if cup_pose is None else np.asarray(cup_pose, float)
+        centre = None if ball is None else np.asarray(ball, float)
+        above = np.inf if centre is None else centre[2]
+        for ends, radius in capsules:
+            if ends[:, 2].mean() <= above:
+                self._paint_capsule(picture, ends, float(radius), ARM_GREY)
+        ball_in_cup = centre is not None and pose is not None and self._inside_cup(centre, pose)
+        if pose is not None and (ball_in_cup or pose[2, 3] <= above):
+            self._paint_cup(picture, pose)
+        if centre is not None:
+            self._paint_ball(picture, centre, np.asarray(ball_velocity, float))
+        if pose is not None and not ball_in_cup and pose[2, 3] > above:
+            self._paint_cup(picture, pose)
+        for ends, radius in capsules:
+            if ends[:, 2].mean() > above:
+                self._paint_capsule(picture, ends, float(radius), ARM_GREY)
+        return self._expose(picture, light)
+
+    def render_board(self, pose: ArrayLike, board: Chessboard | None = None, light: float = 1.0) -> Picture:
+        """One image of a calibration board held at `pose` (4, 4), board frame to base frame; nothing else in view."""
+        board = board or Chessboard()
+        frame = np.asarray(pose, float)
+
+        def point_at(pixels: Array) -> Array:
+            return (self._on_plane(pixels, frame[:3, 3], frame[:3, 2]) - frame[:3, 3]) @ frame[:3, :3]
+
+        outline = self.project(board.outline() @ frame[:3, :3].T + frame[:3, 3])
+        (left, top), (right, bottom) = outline.min(axis=0), outline.max(axis=0)
+        box = self._box((left + right) / 2, (top + bottom) / 2, (right - left) / 2 + 2, (bottom - top) / 2 + 2)
+        picture = self.background.copy()
+        if box is not None:
+            pixels = self._grid[box]
+            grey = supersampled(pixels, lambda at: board.grey(point_at(at)), 4) * self.illumination[box]
+            seen = board.covers(point_at(pixels))
+            picture[box] = np.where(seen, np.clip(np.rint(grey), 0, 255).astype(np.uint8), picture[box])
+        return self._expose(picture, light)
+
+    def _expose(self, picture: Picture, light: float) -> Picture:
+        """Light and noise over the whole image: a window of the noise field that the generator chooses."""
+        row = int(self._rng.integers(NOISE_SIZE - self.height + 1))
+        column = int(self._rng.integers(NOISE_SIZE - self.width + 1))
+        noise = self._noise[row : row + self.height, column : column + self.width]
+        return np.asarray(cv2.addWeighted(picture, light, noise, 1.0, -NOISE_ZERO), np.uint8)
+
+    # Moving things
+
+    def _paint_ball(self, picture: Picture, ball: Array, velocity: Array) -> None:
+        radius = self.ball_radius
+        (u, v), depth = self.project(ball), float(self.to_camera(ball)[2])
+        travel = self.project(ball + 0.5 * self.exposure * velocity) - (u, v)
+        reach = 2.2 * radius * self.focal / depth
+        box = self._box(u, v, reach + abs(travel[0]), reach + abs(travel[1]))
+        if box is None:
+            return
+        rows, columns = box
+        region = picture[rows, columns].astype(np.float32)
+        light = self.illumination[rows, columns]
+        region *= self._shadow(ball, rows, columns)
+        cover, shade = self._sphere(ball, velocity, float(np.hypot(*travel)), rows, columns)
+        region *= 1.0 - cover
+        region += shade * (BALL_GREY * light)
+        picture[rows, columns] = np.clip(np.rint(region), 0, 255).astype(np.uint8)
+
+    def _sphere(
+        self, ball: Array, velocity: Array, travel: float, rows: slice, columns: slice
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Part of each pixel that the ball covers, averaged over the exposure, and that part times its shading."""
+        steps = 1 + 2 * int(np.ceil(travel))
+        moments = ((np.arange(steps) + 0.5) / steps - 0.5) * self.exposure
+        centres = self.to_camera(ball + moments[:, None] * velocity).astype(np.float32)
+        along = np.einsum("hwc,nc->nhw", self._rays[rows, columns], centres)
+        square = np.einsum("nc,nc->n", centres, centres)[:, None, None] - along * along
+        away = np.sqrt(np.maximum(square, 0.0))
+        pixel = centres[:, 2, None, None] / self.focal
+        cover = np.clip(0.5 + (self.ball_radius - away) / pixel, 0.0, 1.0)
+        rise = np.sqrt(np.maximum(self.ball_radius**2 - square, 0.0))
+        lamp = (self.rotation @ LIGHT_DIRECTION).astype(np.float32)
+        # the surface normal's part towards the lamp: (ray * distance - centre) . lamp / radius
+        facing = (along - rise) * (self._rays[rows, columns] @ lamp) - (centres @ lamp)[:, None, None]
+        shade = cover * (0.70 + 0.30 * np.clip(facing / self.ball_radius, 0.0, 1.0))
+        return cover.mean(axis=0, dtype=np.float32), shade.mean(axis=0, dtype=np.float32)
+
+    def _shadow(self, ball: Array, rows: slice, columns: slice) -> NDArray[np.float32]:
+        """Factor on the light of the table around the ball: a soft shadow away from the lamp; none off the table."""
+        height = ball[2] - self.table.top
+        foot = np.array([*(ball[:2] - LIGHT_DIRECTION[:2] / LIGHT_DIRECTION[2] * height), self.table.top])
+        over = self.table.contains(foot[0], foot[1]) and 0.0 < height < 0.2
+        if not over:
+            return np.ones((1, 1), np.float32)
+        (u, v), size = self.project(foot), self.ball_radius * self.focal / float(self.to_camera(foot)[2])
+        du = (np.arange(columns.start, columns.stop, dtype=np.float32) - u) / size
+        dv = (np.arange(rows.start, rows.stop, dtype=np.float32) - v) / size
+        gap = du[None, :] ** 2 + dv[:, None] ** 2
+        return np.asarray(1.0 - SHADOW_DEPTH * np.exp(-gap * gap / 1.5), np.float32)
+
+    def _box(self, u: float, v: float, reach_u: float, reach_v: float) -> tuple[slice, slice] | None:
+        if not (np.isfinite(u) and np.isfinite(v)):
+            return None
+        left, right = max(0, int(u - reach_u)), min(self.width, int(u + reach_u) + 2)
+        top, bottom = max(0, int(v - reach_v)), min(self.height, int(v + reach_v) + 2)
+        return (slice(top, bottom), slice(left, right)) if left < right and top < bottom else None
+
+    def _grey_at(self, uv: Array, grey: float) -> float:
+        u = int(np.clip(uv[0], 0, self.width - 1))
+        v = int(np.clip(uv[1], 0, self.height - 1))
+        return grey * float(self.illumination[v, u])
+
+    def _paint_capsule(self, picture: Picture, ends: Array, radius: float, grey: float) -> None:
+        depth = self.to_camera(ends)[:, 2]
+        if (depth < 4.0 * radius).any():
+            return  # at or behind the lens: out of focus anyway
+        pixels = self.project(ends)
+        sizes = radius * self.focal / depth
+        hull = cv2.convexHull(
+            np.rint((pixels[:, None] + sizes[:, None, None] * CIRCLE) * 16).astype(np.int32).reshape(-1, 2)
+        )
+        cv2.fillConvexPoly(picture, hull, self._grey_at(pixels.mean(axis=0), grey), cv2.LINE_AA, 4)
+
+    def _inside_cup(self, ball: Array, pose: Array) -> bool:
+        local = (ball - pose[:3, 3]) @ pose[:3, :3]
+        return bool(np.hypot(local[0], local[1]) < self.cup_radius and -self.cup_depth < local[2] < self.ball_radius)
+
+    def _paint_cup(self, picture: Picture, pose: Array) -> None:
+        """The wall as the hull of both rims, then the dark mouth as far as it faces the camera."""
+        ring = np.pad(CIRCLE, ((0, 0), (0, 1)))
+        bottom = np.array([0.0, 0.0, -self.cup_depth])
+        outer = ring * (self.cup_radius + CUP_WALL)
+        rims = np.concatenate([outer, outer + bottom]) @ pose[:3, :3].T + pose[:3, 3]
+        mouth = ring * self.cup_radius @ pose[:3, :3].T + pose[:3, 3]
+        if (self.to_camera(rims)[:, 2] < 0.1).any():
+            return
+        pixels = self.project(rims)
+        hull = cv2.convexHull(np.rint(pixels * 16).astype(np.int32))
+        cv2.fillConvexPoly(picture, hull, self._grey_at(pixels[0], CUP_GREY), cv2.LINE_AA, 4)
+        if (self.position - pose[:3, 3]) @ pose[:3, 2] > 0.0:
+            inside = np.rint(self.project(mouth) * 16).astype(np.int32)
+            cv2.fillConvexPoly(picture, inside, self._grey_at(pixels[0], CUP_INSIDE_GREY), cv2.LINE_AA, 4)
+
+
+def _looking_down(camera: Mapping[str, Any]) -> Array:
+    """Nominal camera-from-base rotation: straight down, image x along `image_x`."""
+    right, down = np.asarray(camera["image_x"], float), np.array([0.0, 0.0, -1.0])
+    return np.array([right, np.cross(down, right), down])
