@@ -80,7 +80,6 @@ class Truth:
     image_latency: float
     """s, beyond the camera's own readout."""
     arm_speed: float
-    drag_coefficient: float
     settings: Mapping[str, Any]
     """The whole laboratory file, for what is no error: steps, thrower, friction."""
 
@@ -144,7 +143,6 @@ def read_truth(cell: Mapping[str, Any], regime: str = "A", laboratory: Path = LA
             light_period=float(values["light_period"]),
             image_latency=float(values["image_latency"]),
             arm_speed=float(values["arm_speed"]),
-            drag_coefficient=float(values["drag_coefficient"]),
             settings=settings,
         )
     except KeyError as fault:

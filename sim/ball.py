@@ -1,0 +1,131 @@
+"""The ball's motion where it is known exactly: sliding and rolling on the flat table, and free flight.
+
+A ball on a table slides while its lowest point moves, then rolls. With sliding friction mu the slip velocity keeps its
+direction and shrinks at mu g (1 + 1/k), where k = I / (m r^2); a rolling ball then loses c g of speed each second
+(c: coefficient of rolling resistance). Both phases have closed forms, so no step size enters. Source: rigid-body
+mechanics of a sphere on a plane (e.g. Goldsmith; Marlow, "The Physics of Pocket Billiards", 1995).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+
+class BallState(NamedTuple):
+    """Centre (m), velocity (m/s) and spin (rad/s) of the ball in the base frame, each (x, y, z)."""
+
+    position: tuple[float, float, float]
+    velocity: tuple[float, float, float]
+    spin: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class BallModel:
+    """What does not change from throw to throw; `inertia_factor` is k = I / (m r^2), `friction` the sliding coefficient."""
+
+    radius: float
+    mass: float
+    inertia_factor: float
+    gravity: float
+    friction: float
+
+    @classmethod
+    def of(cls, ball: Mapping[str, Any], friction: float) -> BallModel:
+        """From the `[ball]` table of cell.toml and the true friction."""
+        return cls(ball["radius"], ball["mass"], ball["inertia_factor"], ball["gravity"], friction)
+
+    def spin_of_rolling(self, vx: float, vy: float, share: float = 1.0) -> tuple[float, float, float]:
+        """Spin (rad/s) of a ball that rolls with horizontal velocity (vx, vy), times `share`."""
+        return (-share * vy / self.radius, share * vx / self.radius, 0.0)
+
+
+class TableMotion:
+    """Motion on a flat table from a start state, as a function of the time since then; height is not part of it."""
+
+    def __init__(self, model: BallModel, start: BallState, rolling_resistance: float) -> None:
+        self._model = model
+        self._p = start.position
+        self._v = start.velocity[0], start.velocity[1]
+        self._w = start.spin
+        slip_x = self._v[0] - model.radius * start.spin[1]
+        slip_y = self._v[1] + model.radius * start.spin[0]
+        slip = math.hypot(slip_x, slip_y)
+        self._slip = (slip_x / slip, slip_y / slip) if slip > 0.0 else (0.0, 0.0)
+        self._sliding = model.friction * model.gravity
+        self.rolls_after = slip / (self._sliding * (1.0 + 1.0 / model.inertia_factor))
+        """s until sliding ends."""
+        t = self.rolls_after
+        self._q = self._slide_position(t)
+        self._u = self._slide_velocity(t)
+        self._deceleration = rolling_resistance * model.gravity
+        speed = math.hypot(*self._u)
+        self._heading = (self._u[0] / speed, self._u[1] / speed) if speed > 0.0 else (0.0, 0.0)
+        self._speed = speed
+        self.rests_after = t + (speed / self._deceleration if self._deceleration > 0.0 else math.inf)
+        """s until the ball lies still."""
+
+    def _slide_position(self, t: float) -> tuple[float, float]:
+        half = 0.5 * self._sliding * t * t
+        return (
+            self._p[0] + self._v[0] * t - half * self._slip[0],
+            self._p[1] + self._v[1] * t - half * self._slip[1],
+        )
+
+    def _slide_velocity(self, t: float) -> tuple[float, float]:
+        lost = self._sliding * t
+        return self._v[0] - lost * self._slip[0], self._v[1] - lost * self._slip[1]
+
+    def state(self, t: float) -> BallState:
+        """State `t` >= 0 seconds after the start."""
+        z = self._p[2]
+        if t < self.rolls_after:
+            x, y = self._slide_position(t)
+            vx, vy = self._slide_velocity(t)
+            gained = self._sliding * t / (self._model.inertia_factor * self._model.radius)
+            spin = self._w[0] - gained * self._slip[1], self._w[1] + gained * self._slip[0], self._w[2]
+            return BallState((x, y, z), (vx, vy, 0.0), spin)
+        rolled = min(t, self.rests_after) - self.rolls_after
+        way = self._speed * rolled - 0.5 * self._deceleration * rolled * rolled
+        speed = max(0.0, self._speed - self._deceleration * rolled) if t < self.rests_after else 0.0
+        vx, vy = speed * self._heading[0], speed * self._heading[1]
+        wx, wy, _ = self._model.spin_of_rolling(vx, vy)
+        x, y = self._q[0] + way * self._heading[0], self._q[1] + way * self._heading[1]
+        return BallState((x, y, z), (vx, vy, 0.0), (wx, wy, self._w[2]))
+
+    def first_crossing(self, axis: int, value: float) -> float:
+        """Seconds until the centre's x (axis 0) or y (axis 1) first equals `value`; inf if never."""
+        sliding = _first_root(
+            self._p[axis] - value, self._v[axis], -0.5 * self._sliding * self._slip[axis], self.rolls_after
+        )
+        if sliding < math.inf:
+            return sliding
+        rolling = _first_root(
+            self._q[axis] - value,
+            self._u[axis],
+            -0.5 * self._deceleration * self._heading[axis],
+            self.rests_after - self.rolls_after,
+        )
+        return self.rolls_after + rolling
+
+
+def _first_root(c: float, b: float, a: float, until: float) -> float:
+    """Smallest t in [0, until] with a t^2 + b t + c = 0; inf if there is none."""
+    if a == 0.0:
+        roots = [-c / b] if b != 0.0 else []
+    else:
+        discriminant = b * b - 4.0 * a * c
+        if discriminant < 0.0:
+            return math.inf
+        # the stable form: no difference of nearly equal numbers
+        q = -0.5 * (b + math.copysign(math.sqrt(discriminant), b))
+        roots = [q / a] + ([c / q] if q != 0.0 else [])
+    return min((t for t in roots if 0.0 <= t <= until), default=math.inf)
+
+
+def fly(start: BallState, t: float, gravity: float) -> BallState:
+    """Free flight without air drag, `t` seconds after `start`; spin is kept."""
+    (x, y, z), (vx, vy, vz), spin = start
+    return BallState((x + vx * t, y + vy * t, z + vz * t - 0.5 * gravity * t * t), (vx, vy, vz - gravity * t), spin)

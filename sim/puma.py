@@ -1,0 +1,210 @@
+"""The arm as a body that torques move: rigid-body dynamics, rotors, friction, brakes, hard stops.
+
+Mass matrix and bias torques come from PyBullet on the published values; rotor inertia (up to 2.3 kg m^2 at the joint, more
+than most links) is added here, as URDF has no place for it. Integration is semi-implicit Euler. An arm that stands
+still, held by friction or brakes, costs next to nothing.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pybullet
+
+from sim.puma_model import JOINTS, ArmModel, Link
+from sim.puma_urdf import urdf
+from sim.truth import Vector
+
+_REFRESH = 4
+"""Steps after which the mass matrix is computed anew; at full joint speed it changes by less than 0.5 % meanwhile."""
+_STILL = 1e-4
+"""rad/s; slower than this and held by friction, a joint stops."""
+_BRAKE = 2.0
+"""Torque of a joint's brake as a multiple of the motor's."""
+_FADE = 0.15
+"""Above its greatest speed the motor's torque fades to nothing within this share of it (back EMF)."""
+
+
+class RigidBody:
+    """Mass matrix and bias torques of the arm by PyBullet, without rotors and friction; a physics client of its own."""
+
+    def __init__(self, model: ArmModel, gravity: float, flange_load: Link | None = None) -> None:
+        self._client = pybullet.connect(pybullet.DIRECT)
+        pybullet.setGravity(0.0, 0.0, -gravity, physicsClientId=self._client)
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "arm.urdf"
+            file.write_text(urdf(model, flange_load), encoding="utf-8")
+            self._body = pybullet.loadURDF(
+                str(file), useFixedBase=True, flags=pybullet.URDF_USE_INERTIA_FROM_FILE, physicsClientId=self._client
+            )
+        self._zero = [0.0] * JOINTS
+
+    def mass_matrix(self, q: Sequence[float]) -> Vector:
+        """(6, 6) kg m^2."""
+        return np.array(pybullet.calculateMassMatrix(self._body, list(q), physicsClientId=self._client))
+
+    def bias(self, q: Sequence[float], qd: Sequence[float]) -> list[float]:
+        """Six torques (N m) that hold the arm against gravity, Coriolis and centrifugal forces."""
+        torques = pybullet.calculateInverseDynamics(
+            self._body, list(q), list(qd), self._zero, physicsClientId=self._client
+        )
+        return list(torques)
+
+    def link_frame(self, q: Sequence[float], link: int) -> tuple[Vector, Vector]:
+        """Origin (3,) and rotation (3, 3) of a URDF link (0 to 5) as PyBullet places it; for checks."""
+        for joint, angle in enumerate(q):
+            pybullet.resetJointState(self._body, joint, angle, physicsClientId=self._client)
+        state = pybullet.getLinkState(self._body, link, computeForwardKinematics=1, physicsClientId=self._client)
+        return np.array(state[4]), np.array(pybullet.getMatrixFromQuaternion(state[5])).reshape(3, 3)
+
+    def close(self) -> None:
+        """End the physics client."""
+        if self._client >= 0:
+            pybullet.disconnect(physicsClientId=self._client)
+            self._client = -1
+
+
+class ArmPlant:
+    """The arm as its drives feel it: six torques in, six positions and speeds out.
+
+    `q` (rad) and `qd` (rad/s) are as the encoders show them, lists of six floats; do not write to them. Drives put
+    torques (N m at the joint) into `tau` and engage or release brakes; `step` moves the arm on. Plain floats, as six
+    numbers are too few for an array to pay (11 us a step against 30).
+    """
+
+    def __init__(
+        self,
+        model: ArmModel,
+        gravity: float,
+        start: Sequence[float],
+        speed_factor: float = 1.0,
+        load: Link | None = None,
+    ) -> None:
+        """`speed_factor`: share of its joint speeds that the arm reaches (a slow arm); `load`: what the flange carries."""
+        self.model = model
+        self.q: list[float] = [float(angle) for angle in start]
+        self.qd: list[float] = [0.0] * JOINTS
+        self.tau: list[float] = [0.0] * JOINTS
+        self.moves = 0
+        """Counts the steps in which the arm moved: unchanged means that the pose is unchanged."""
+        self.still = True
+        """Whether no joint moves."""
+        self._body = RigidBody(model, gravity, load)
+        self._limit: list[float] = model.torque.tolist()
+        self._viscous: list[float] = model.viscous.tolist()
+        self._dry: list[float] = model.coulomb.tolist()
+        self._stops: list[tuple[float, float]] = list(zip(model.lower.tolist(), model.upper.tolist(), strict=True))
+        self._braked = [True] * JOINTS
+        self._hold = [dry + _BRAKE * limit for dry, limit in zip(self._dry, self._limit, strict=True)]
+        self._friction = [0.0] * JOINTS
+        self._bias = self._body.bias(self.q, self.qd)
+        self.slow_down(speed_factor)
+        self._refresh()
+
+    @property
+    def braked(self) -> tuple[bool, ...]:
+        """Which brakes are engaged."""
+        return tuple(self._braked)
+
+    def brake(self, joint: int) -> None:
+        """Engage the brake of a joint (0 to 5) and take its torque away."""
+        self.tau[joint] = 0.0
+        self._braked[joint] = True
+        self._hold[joint] = self._dry[joint] + _BRAKE * self._limit[joint]
+
+    def release(self, joint: int) -> None:
+        """Release the brake of a joint (0 to 5)."""
+        self._braked[joint] = False
+        self._hold[joint] = self._dry[joint]
+
+    def slow_down(self, factor: float) -> None:
+        """From now on the joints reach this share (0 to 1] of their greatest speeds."""
+        if not 0.0 < factor <= 1.0:
+            raise ValueError(f"speed factor {factor}: must be above 0 and at most 1")
+        self._greatest: list[float] = (self.model.speed * factor).tolist()
+
+    def step(self, dt: float, tau: Sequence[float] | None = None) -> None:
+        """Move on by `dt` (s) under torques `tau` (six, N m), those in `self.tau` if None."""
+        if tau is not None:
+            self.tau[:] = tau
+        drive = self._motor_torque()
+        if self.still and _held(drive, self._bias, self._hold):
+            return
+        self._integrate(dt, drive)
+
+    def _motor_torque(self) -> list[float]:
+        """What the motors give: within the torque limits, fading above the greatest speed for what would speed up."""
+        torques = []
+        for tau, limit, speed, greatest in zip(self.tau, self._limit, self.qd, self._greatest, strict=True):
+            high = low = limit
+            if speed > greatest:
+                high *= max(0.0, 1.0 - (speed / greatest - 1.0) / _FADE)
+            elif speed < -greatest:
+                low *= max(0.0, 1.0 - (-speed / greatest - 1.0) / _FADE)
+            torques.append(high if tau > high else -low if tau < -low else tau)
+        return torques
+
+    def _integrate(self, dt: float, drive: list[float]) -> None:
+        self._since_refresh += 1
+        if self._since_refresh >= _REFRESH:
+            self._refresh()
+        q, qd, friction = self.q, self.qd, self._friction
+        self._bias = bias = self._body.bias(q, qd)
+        push = [u - b - c * v + f for u, b, c, v, f in zip(drive, bias, self._viscous, qd, friction, strict=True)]
+        speed = [v + dt * a for v, a in zip(qd, self._accelerate(push), strict=True)]
+        speed = self._rub(dt, speed)
+        self.moves += 1
+        if max(speed) < _STILL and min(speed) > -_STILL and _held(drive, bias, self._hold):
+            self.still, self.qd = True, [0.0] * JOINTS
+            return
+        self.still = False
+        self.q = [angle + dt * v for angle, v in zip(q, speed, strict=True)]
+        self.qd = speed
+        self._stop_at_ends()
+
+    def _accelerate(self, torque: list[float]) -> list[float]:
+        """Inverse mass matrix times `torque`."""
+        t0, t1, t2, t3, t4, t5 = torque
+        return [a * t0 + b * t1 + c * t2 + d * t3 + e * t4 + f * t5 for a, b, c, d, e, f in self._inverse]
+
+    def _rub(self, dt: float, speed: list[float]) -> list[float]:
+        """Speeds after dry friction: the torque that would stop the joint within the step, at most its limit.
+
+        Last step's friction is the first guess (already in `speed`), so the coupling of the joints settles over a few steps.
+        """
+        change, old = [], self._friction
+        self._friction = []
+        for f, v, gain, hold in zip(old, speed, self._diagonal, self._hold, strict=True):
+            wanted = f - v / (dt * gain)
+            wanted = hold if wanted > hold else -hold if wanted < -hold else wanted
+            self._friction.append(wanted)
+            change.append(wanted - f)
+        if not any(change):
+            return speed
+        return [v + dt * a for v, a in zip(speed, self._accelerate(change), strict=True)]
+
+    def _stop_at_ends(self) -> None:
+        for i, (low, high) in enumerate(self._stops):
+            if not low <= self.q[i] <= high:
+                self.q[i] = min(max(self.q[i], low), high)
+                self.qd[i] = 0.0
+
+    def _refresh(self) -> None:
+        mass = self._body.mass_matrix(self.q)
+        mass[np.diag_indices(JOINTS)] += self.model.rotor
+        inverse = np.linalg.inv(mass)
+        self._inverse: list[list[float]] = inverse.tolist()
+        self._diagonal: list[float] = np.diag(inverse).tolist()
+        self._since_refresh = 0
+
+    def close(self) -> None:
+        """End the physics client."""
+        self._body.close()
+
+
+def _held(drive: list[float], bias: list[float], hold: list[float]) -> bool:
+    """Whether friction and brakes can hold a standing arm against what pulls at it."""
+    return all(-h <= u - b <= h for u, b, h in zip(drive, bias, hold, strict=True))
