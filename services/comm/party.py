@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 TICK = 0.004
 """Length of a lock-step tick (s): one cycle of the 250 Hz servo loop."""
@@ -29,6 +29,14 @@ class Envelope:
     target: str
     channel: str
     body: Any
+
+
+class Posted(NamedTuple):
+    """An envelope on its way: due at a tick, and the how-manieth of its source it is (from 0)."""
+
+    due: int
+    sequence: int
+    envelope: Envelope
 
 
 class Party(Protocol):

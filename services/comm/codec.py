@@ -1,0 +1,316 @@
+"""Messages as bytes and back: a msgpack array `[kind, field, ...]` for each, every field checked on its way in."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable, Mapping
+from operator import attrgetter
+from typing import Any, NamedTuple, get_args
+
+import msgpack
+import numpy as np
+
+from services.comm import messages as m
+from services.comm.canbus import Frame
+from services.comm.messages import Executed, Message, Tick
+from services.comm.party import Envelope, Posted
+from services.comm.plain import NotPlainError, inspect, pack_array, unpack_array
+
+KIB, MIB = 1024, 1024 * 1024
+
+LIMITS: Mapping[int, int] = {
+    m.Hello.KIND: 4 * KIB,
+    m.Welcome.KIND: MIB,
+    m.Refuse.KIND: 4 * KIB,
+    m.Call.KIND: 16 * MIB,
+    m.Accept.KIND: KIB,
+    m.Feedback.KIND: 64 * KIB,
+    m.Outcome.KIND: 16 * MIB,
+    m.ResultAck.KIND: 64 * KIB,
+    m.Cancel.KIND: 4 * KIB,
+    m.Event.KIND: MIB,
+    m.EventAck.KIND: KIB,
+    m.Subscribe.KIND: 64 * KIB,
+    m.Command.KIND: 64 * KIB,
+    m.Answer.KIND: MIB,
+    m.Ping.KIND: 32,
+    m.Pong.KIND: 32,
+    m.Tick.KIND: 16 * MIB,
+    m.Bye.KIND: 4 * KIB,
+    m.Challenge.KIND: 128,
+    m.Proof.KIND: 128,
+    m.StreamOpen.KIND: 2 * KIB,
+    m.SetPoint.KIND: 4 * KIB,
+    m.Withdraw.KIND: 16,
+}
+"""Largest body of each kind (bytes), the MAC not counted."""
+
+NAME_LENGTH = 255
+"""Longest name, id or code (characters)."""
+MAX_CONTAINERS = 100_000
+"""Most arrays and maps in one message: one byte each on the wire, some 70 in memory."""
+_UNCOUNTED = 64 * KIB
+_ARRAY, _MESSAGE = 1, 2
+"""msgpack extension types inside Tick: an array of numbers, a message."""
+
+
+class ProtocolError(Exception):
+    """The other side broke the protocol. `code` is for programs, `text` for people; `before` came well before the fault."""
+
+    def __init__(self, code: str, text: str, before: Iterable[Message] = ()) -> None:
+        super().__init__(f"{code}: {text}")
+        self.code = code
+        self.text = text
+        self.before = tuple(before)
+
+
+class _FieldError(ValueError):
+    """What is wrong with one field; `decode` adds which."""
+
+
+def _name(value: str) -> str:
+    if len(value) > NAME_LENGTH:
+        raise _FieldError(f"longer than {NAME_LENGTH} characters")
+    return value
+
+
+def _count(value: int) -> int:
+    if not 0 <= value < 2**63:
+        raise _FieldError("not from 0 to 2^63 - 1")
+    return value
+
+
+def _duration(value: float) -> float:
+    if not 0.0 <= value < math.inf:
+        raise _FieldError("not a finite number >= 0")
+    return value
+
+
+def _duration_or_none(value: float | None) -> float | None:
+    return None if value is None else _duration(value)
+
+
+def _plain_map(value: dict[Any, Any]) -> dict[Any, Any]:
+    if value:
+        inspect(value)
+    return value
+
+
+def _names(value: list[Any]) -> tuple[str, ...]:
+    for item in value:
+        if type(item) is not str:
+            raise _FieldError("not an array of str")
+        _name(item)
+    return tuple(value)
+
+
+def _numbers(value: list[Any]) -> tuple[float, ...]:
+    for item in value:
+        if type(item) not in (float, int) or not math.isfinite(item):
+            raise _FieldError("not an array of finite numbers")
+    return tuple(map(float, value))
+
+
+def _executed(value: str) -> Executed:
+    try:
+        return Executed(value)
+    except ValueError:
+        raise _FieldError("not yes, no or unknown") from None
+
+
+def _posted_all(value: tuple[Any, ...]) -> tuple[Posted, ...]:
+    return tuple(map(_posted, value))
+
+
+def _posted(item: Any) -> Posted:
+    if type(item) is not tuple or tuple(map(type, item[:6])) != (int, int, str, str, str, str) or len(item) != 7:
+        raise _FieldError("not an envelope")
+    due, sequence, party, source, target, channel, body = item
+    inspect(body, _LEAVES)
+    return Posted(_count(due), _count(sequence), Envelope(party, source, target, channel, _body_in(channel, body)))
+
+
+def _body_in(channel: str, body: Any) -> Any:
+    if channel != "can" or type(body) is not tuple:
+        return body
+    if len(body) == 2 and type(body[0]) is int and type(body[1]) is bytes:
+        return Frame(*body)
+    return tuple(_body_in(channel, item) for item in body)
+
+
+class _Field(NamedTuple):
+    """How a field of one annotation looks on the wire, and what is checked beyond its type."""
+
+    types: tuple[type, ...]
+    check: Callable[[Any], Any] | None
+
+
+_FIELDS = {
+    "str": _Field((str,), _name),
+    "bytes": _Field((bytes,), None),
+    "bool": _Field((bool,), None),
+    "int": _Field((int,), _count),
+    "float": _Field((float,), _duration),
+    "float | None": _Field((float, type(None)), _duration_or_none),
+    "Executed": _Field((str,), _executed),
+    "Mapping[str, Any]": _Field((dict,), _plain_map),
+    "tuple[str, ...]": _Field((list,), _names),
+    "tuple[float, ...]": _Field((list,), _numbers),
+    "tuple[Any, ...]": _Field((tuple,), _posted_all),
+}
+_FREE_TEXT = frozenset(("text", "reason"))
+
+
+class _Spec:
+    """One kind of message: how its fields are read and written."""
+
+    __slots__ = ("checks", "cls", "fields", "limit", "long_checks", "names", "read", "required", "types")
+
+    def __init__(self, cls: type[Message]) -> None:
+        described = dataclasses.fields(cls)
+        self.cls: Callable[..., Message] = cls
+        self.names = [field.name for field in described]
+        self.fields = [_FIELDS[str(field.type)] for field in described]
+        self.required = sum(
+            field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING for field in described
+        )
+        self.limit = LIMITS[cls.KIND]
+        self.types = tuple(field.types[0] for field in self.fields)
+        self.checks = self._checks(short=True)
+        self.long_checks = self._checks(short=False)
+        self.read = _reader(self.names)
+
+    def _checks(self, short: bool) -> tuple[tuple[int, Callable[[Any], Any]], ...]:
+        """Checks by position; a body shorter than the longest name needs none of its names measured."""
+        return tuple(
+            (index, field.check)
+            for index, (name, field) in enumerate(zip(self.names, self.fields, strict=True))
+            if field.check is not None and not (field.check is _name and (short or name in _FREE_TEXT))
+        )
+
+
+def _reader(names: list[str]) -> Callable[[Any], tuple[Any, ...]]:
+    if len(names) > 1:
+        return attrgetter(*names)
+    return lambda message: tuple(getattr(message, name) for name in names)
+
+
+_SPECS: dict[int, _Spec] = {cls.KIND: _Spec(cls) for cls in get_args(Message)}
+_LEAVES: frozenset[type] = frozenset((np.ndarray, *get_args(Message)))
+_packer = msgpack.Packer(buf_size=64 * KIB)
+
+
+def encode(message: Message) -> bytes:
+    """Body of a frame, without length and MAC. Raises ProtocolError if the message is no message or too large."""
+    kind = message.KIND
+    spec = _SPECS[kind]
+    try:
+        if kind == Tick.KIND:
+            body: bytes = msgpack.packb([kind, *_tick_out(message)], default=_extension)
+        else:
+            body = _packer.pack([kind, *spec.read(message)])
+    except (TypeError, ValueError, OverflowError) as fault:
+        raise ProtocolError("unencodable", f"{type(message).__name__}: {fault}") from None
+    if len(body) > spec.limit:
+        text = f"a {type(message).__name__} of {len(body)} bytes is above its limit of {spec.limit}"
+        raise ProtocolError("too_large", text)
+    return body
+
+
+def _tick_out(tick: Any) -> tuple[int, list[Any]]:
+    rows = []
+    for due, sequence, envelope in tick.envelopes:
+        rows.append((due, sequence, envelope.party, envelope.source, envelope.target, envelope.channel, envelope.body))
+    return tick.number, rows
+
+
+def _extension(value: Any) -> msgpack.ExtType:
+    if isinstance(value, np.ndarray):
+        return msgpack.ExtType(_ARRAY, pack_array(value))
+    if type(value) in _LEAVES and type(value) is not Tick:
+        return msgpack.ExtType(_MESSAGE, encode(value))
+    raise TypeError(f"a {type(value).__name__} cannot travel in an envelope")
+
+
+def _extension_in(code: int, data: bytes) -> Any:
+    if code == _ARRAY:
+        return unpack_array(data)
+    if code == _MESSAGE and kind_of(data) != Tick.KIND:
+        return decode(data)
+    raise _FieldError(f"unknown extension type {code}")
+
+
+def _no_extension(code: int, data: bytes) -> Any:
+    raise _FieldError(f"unknown extension type {code}")
+
+
+def kind_of(head: bytes | bytearray) -> int:
+    """Kind of the message whose body begins so (2 bytes needed). Raises ProtocolError if there is no such kind."""
+    if len(head) < 2 or not 0x91 <= head[0] <= 0x9F or head[1] not in _SPECS:
+        raise ProtocolError("unknown_kind", "a body begins with an array of 1 to 15 fields and a known kind")
+    return head[1]
+
+
+def decode(body: bytes) -> Message:
+    """The message in a frame's body. Raises ProtocolError and nothing else."""
+    kind = kind_of(body)
+    spec = _SPECS[kind]
+    if len(body) > spec.limit:
+        raise ProtocolError("too_large", f"kind {kind}: {len(body)} bytes are above the limit of {spec.limit}")
+    try:
+        fields = _unpack(body, kind)
+        if tuple(map(type, fields[1:])) != spec.types:
+            fields = _other_types(spec, fields)
+        index = 0
+        for index, check in spec.checks if len(body) <= NAME_LENGTH else spec.long_checks:
+            if index < len(fields) - 1:
+                fields[index + 1] = check(fields[index + 1])
+    except _FieldError as fault:
+        raise ProtocolError("malformed", f"kind {kind}: {fault}") from None
+    except NotPlainError as fault:
+        raise ProtocolError("malformed", f"kind {kind}, {spec.names[index]}: {fault}") from None
+    return spec.cls(*fields[1:])
+
+
+class _Counter:
+    """Counts arrays and maps while a large body is read."""
+
+    def __init__(self) -> None:
+        self.left = MAX_CONTAINERS
+
+    def __call__(self, container: Any) -> Any:
+        self.left -= 1
+        if self.left < 0:
+            raise _FieldError(f"more than {MAX_CONTAINERS} arrays and maps")
+        return container
+
+
+def _unpack(body: bytes, kind: int) -> list[Any]:
+    options: dict[str, Any] = {}
+    if len(body) > _UNCOUNTED:
+        options["list_hook"] = options["object_hook"] = _Counter()
+    try:
+        if kind == Tick.KIND:
+            fields = msgpack.unpackb(body, use_list=False, ext_hook=_extension_in, **options)
+        else:
+            fields = msgpack.unpackb(body, ext_hook=_no_extension, **options)
+    except (_FieldError, NotPlainError, ProtocolError) as fault:
+        raise _FieldError(str(fault)) from None
+    except Exception as fault:
+        # msgpack raises its own kinds, ValueError, UnicodeDecodeError and RecursionError on bad bytes.
+        raise _FieldError(f"not msgpack: {type(fault).__name__}") from None
+    return list(fields)
+
+
+def _other_types(spec: _Spec, fields: list[Any]) -> list[Any]:
+    """Fields that differ from the usual types: trailing ones left out, int for float, nil where it may stand."""
+    if not spec.required <= len(fields) - 1 <= len(spec.fields):
+        raise _FieldError(f"{len(fields) - 1} fields instead of {len(spec.fields)}")
+    for position, (name, field) in enumerate(zip(spec.names[: len(fields) - 1], spec.fields, strict=False), 1):
+        value = fields[position]
+        if type(value) is int and field.types[0] is float:
+            fields[position] = float(value)
+        elif type(value) not in field.types:
+            raise _FieldError(f"{name} is a {type(value).__name__}, not a {field.types[0].__name__}")
+    return fields

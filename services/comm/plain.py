@@ -1,0 +1,123 @@
+"""Plain data: what may stand in a message's arguments, values and data, checked on its way in and on its way out.
+
+Plain is None, bool, int (64 bits), float, str, bytes, list and dict with str keys, nested at most `DEPTH` deep. Arrays of
+numbers (`ndarray` of uint8 or float64) are plain only inside the envelopes of lock step.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from types import NoneType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+DEPTH = 32
+"""How deep plain data may be nested."""
+
+SCALARS = frozenset((NoneType, bool, int, float, str, bytes))
+_KEYS = frozenset((str,))
+_INT_MIN, _INT_MAX = -(2**63), 2**64 - 1
+
+_BASES: tuple[tuple[type, Callable[[Any], Any]], ...] = ((str, str), (bytes, bytes), (int, int), (float, float))
+_DTYPES: Mapping[int, np.dtype[Any]] = {1: np.dtype("u1"), 2: np.dtype("<f8")}
+_CODES = {dtype: code for code, dtype in _DTYPES.items()}
+_MAX_DIMENSIONS = 4
+
+
+class NotPlainError(TypeError):
+    """A value that no message can carry; its text says where in the data and what to do."""
+
+
+def plain(value: Any, where: str = "value") -> Any:
+    """The same data in plain types only: a copy, tuples as lists, numpy scalars as Python numbers.
+
+    Done by the sender, so that a value is refused where it was made and both ends see the same types whether they live in
+    one process or in two. `where` names the data in the error. Raises NotPlainError.
+    """
+    return _plain(value, where, DEPTH)
+
+
+def _plain(value: Any, where: str, depth: int) -> Any:
+    kind = type(value)
+    if kind in SCALARS:
+        if kind is int and not _INT_MIN <= value <= _INT_MAX:
+            raise NotPlainError(f"{where}: the integer {value} does not fit in 64 bits")
+        return value
+    if depth == 0:
+        raise NotPlainError(f"{where}: nested deeper than {DEPTH} levels")
+    if kind is dict or isinstance(value, Mapping):
+        return {_key(key, where): _plain(item, f"{where}.{key}", depth - 1) for key, item in value.items()}
+    if kind is list or kind is tuple:
+        return _plain_list(value, where, depth)
+    return _plain_other(value, where, depth)
+
+
+def _plain_list(value: Sequence[Any], where: str, depth: int) -> list[Any]:
+    if set(map(type, value)) <= {float, str, bool, bytes, NoneType}:
+        return list(value)
+    return [_plain(item, f"{where}[{index}]", depth - 1) for index, item in enumerate(value)]
+
+
+def _plain_other(value: Any, where: str, depth: int) -> Any:
+    if isinstance(value, np.generic):
+        return _plain(value.item(), where, depth - 1)
+    for base, convert in _BASES:
+        if isinstance(value, base):
+            return _plain(convert(value), where, depth)
+    if isinstance(value, (list, tuple)):
+        return _plain_list(value, where, depth)
+    remedy = "; use .tolist()" if isinstance(value, np.ndarray) else ""
+    raise NotPlainError(f"{where}: a {type(value).__name__} is not plain data{remedy}")
+
+
+def _key(key: Any, where: str) -> str:
+    if type(key) is not str:
+        raise NotPlainError(f"{where}: the key {key!r} is not a str")
+    return key
+
+
+def inspect(value: Any, extra: frozenset[type] = frozenset(), depth: int = DEPTH) -> None:
+    """Refuse decoded data that is not plain or nested too deep. `extra` are further leaf types. Raises NotPlainError."""
+    kind = type(value)
+    if kind in SCALARS or kind in extra:
+        return
+    if kind is dict:
+        if not _KEYS.issuperset(map(type, value)):
+            raise NotPlainError("a key of a map is not a str")
+        inner = value.values()
+    elif kind is list or kind is tuple:
+        inner = value
+    else:
+        raise NotPlainError(f"a {kind.__name__} is not plain data")
+    if depth == 0:
+        raise NotPlainError(f"nested deeper than {DEPTH} levels")
+    if not SCALARS.issuperset(map(type, inner)):
+        for item in inner:
+            inspect(item, extra, depth - 1)
+
+
+def pack_array(array: NDArray[Any]) -> bytes:
+    """An array as bytes: dtype code, number of dimensions, u32 lengths, numbers in C order. Raises NotPlainError."""
+    code = _CODES.get(array.dtype)
+    if code is None or array.ndim > _MAX_DIMENSIONS:
+        raise NotPlainError(f"an array of {array.dtype} with {array.ndim} dimensions: only uint8 or float64, at most 4")
+    return struct.pack(f">BB{array.ndim}I", code, array.ndim, *array.shape) + array.tobytes()
+
+
+def unpack_array(data: bytes) -> NDArray[Any]:
+    """Inverse of `pack_array`, read-only. Raises NotPlainError on anything but a whole array."""
+    if len(data) < 2 or data[0] not in _DTYPES or data[1] > _MAX_DIMENSIONS or len(data) < 2 + 4 * data[1]:
+        raise NotPlainError("malformed array")
+    dtype = _DTYPES[data[0]]
+    start = 2 + 4 * data[1]
+    shape = struct.unpack(f">{data[1]}I", data[2:start])
+    count = 1
+    for length in shape:
+        count *= length
+    if count * dtype.itemsize != len(data) - start:
+        raise NotPlainError("malformed array: its length does not fit its shape")
+    array: NDArray[Any] = np.frombuffer(data, dtype, offset=start).reshape(shape)
+    return array

@@ -1,0 +1,340 @@
+"""One connection of the node protocol as a machine: bytes in, messages out, and the other way round.
+
+A frame is a u32 length (big endian), a body (`codec.py`) and, on a connection with a key, a seal of 16 bytes that the
+length counts. No socket, clock or randomness of its own: the shell passes bytes and the nonce. Nothing but ProtocolError
+leaves it.
+
+    opening  client: HELLO ->                       server: <- WELCOME or REFUSE
+    with a key:      HELLO ->  <- CHALLENGE  PROOF ->        <- WELCOME or REFUSE
+    open     everything else, sealed if there is a key
+    closing  BYE or REFUSE was sent: nothing more goes out, what comes in is dropped
+    closed   BYE or REFUSE came, or the other side broke the protocol
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from enum import Enum
+from typing import Final
+
+from services.comm.codec import LIMITS, ProtocolError, decode, encode, kind_of
+from services.comm.messages import (
+    Accept,
+    Answer,
+    Bye,
+    Call,
+    Cancel,
+    Challenge,
+    Command,
+    Event,
+    EventAck,
+    Feedback,
+    Hello,
+    Message,
+    Outcome,
+    Ping,
+    Pong,
+    Proof,
+    Refuse,
+    ResultAck,
+    SetPoint,
+    StreamOpen,
+    Subscribe,
+    Tick,
+    Welcome,
+    Withdraw,
+)
+from services.comm.security import NONCE_BYTES, PROOF_BYTES, SEAL_BYTES, Seal, proof, same
+
+__all__ = ["NEWEST_VERSION", "OLDEST_VERSION", "Connection", "ProtocolError", "Side", "State", "negotiate"]
+
+OLDEST_VERSION: Final = 1
+NEWEST_VERSION: Final = 1
+"""Versions of the protocol that this code speaks."""
+
+_HEADER: Final = 4
+
+
+class Side(Enum):
+    """Which end of the connection this is."""
+
+    CLIENT = "client"
+    SERVER = "server"
+
+
+class State(Enum):
+    """Where a connection stands."""
+
+    OPENING = "opening"
+    OPEN = "open"
+    CLOSING = "closing"
+    CLOSED = "closed"
+
+
+class _Phase(Enum):
+    """State in full: what the next message may be."""
+
+    HELLO = "hello"
+    """Nothing was said yet."""
+    HELLO_SENT = "hello sent"
+    CHALLENGED = "challenged"
+    """Server: proof awaited."""
+    PROVED = "proved"
+    """Client: proof sent."""
+    DECIDING = "deciding"
+    """Server: its owner answers WELCOME or REFUSE."""
+    OPEN = "open"
+    CLOSING = "closing"
+    CLOSED = "closed"
+
+
+_STATES: Mapping[_Phase, State] = {
+    _Phase.OPEN: State.OPEN,
+    _Phase.CLOSING: State.CLOSING,
+    _Phase.CLOSED: State.CLOSED,
+}
+
+_BOTH = frozenset(cls.KIND for cls in (Ping, Pong, Tick, Bye, Refuse))
+_FROM_CLIENT = _BOTH | {
+    cls.KIND for cls in (Call, ResultAck, Cancel, EventAck, Subscribe, Command, StreamOpen, SetPoint, Withdraw)
+}
+_FROM_SERVER = _BOTH | {cls.KIND for cls in (Accept, Feedback, Outcome, Event, Answer)}
+_NOTHING: frozenset[int] = frozenset()
+_REFUSE = frozenset((Refuse.KIND,))
+
+_MAY_COME: Mapping[tuple[Side, _Phase], frozenset[int]] = {
+    (Side.SERVER, _Phase.HELLO): frozenset((Hello.KIND,)),
+    (Side.SERVER, _Phase.CHALLENGED): _REFUSE | {Proof.KIND},
+    (Side.SERVER, _Phase.OPEN): _FROM_CLIENT,
+    (Side.CLIENT, _Phase.HELLO_SENT): _REFUSE | {Challenge.KIND, Welcome.KIND},
+    (Side.CLIENT, _Phase.PROVED): _REFUSE | {Welcome.KIND},
+    (Side.CLIENT, _Phase.OPEN): _FROM_SERVER,
+}
+_MAY_GO: Mapping[tuple[Side, _Phase], frozenset[int]] = {
+    (Side.CLIENT, _Phase.HELLO): frozenset((Hello.KIND,)),
+    (Side.CLIENT, _Phase.HELLO_SENT): _REFUSE,
+    (Side.CLIENT, _Phase.PROVED): _REFUSE,
+    (Side.CLIENT, _Phase.OPEN): _FROM_CLIENT,
+    (Side.SERVER, _Phase.HELLO): _REFUSE,
+    (Side.SERVER, _Phase.CHALLENGED): _REFUSE,
+    (Side.SERVER, _Phase.DECIDING): _REFUSE | {Welcome.KIND},
+    (Side.SERVER, _Phase.OPEN): _FROM_SERVER,
+}
+_LAST = frozenset((Bye.KIND, Refuse.KIND))
+
+
+def negotiate(oldest: int, newest: int) -> int | None:
+    """The newest version that this code and a peer with the range [oldest, newest] both speak; None if there is none."""
+    version = min(newest, NEWEST_VERSION)
+    return version if version >= max(oldest, OLDEST_VERSION) and oldest <= newest else None
+
+
+class Connection:
+    """One end of a connection. `nonce` (32 fresh random bytes) is needed with a `key`.
+
+    A server sees HELLO only after its sender has proved the key, and then sends WELCOME or REFUSE.
+    """
+
+    def __init__(self, side: Side, *, key: bytes | None = None, nonce: bytes = b"") -> None:
+        if key is not None and len(nonce) != NONCE_BYTES:
+            raise ValueError(f"a connection with a key needs a nonce of {NONCE_BYTES} bytes")
+        self.side = side
+        self.version = 0
+        """Version agreed on; 0 before WELCOME."""
+        self._key = key
+        self._nonce = nonce
+        self._phase = _Phase.HELLO
+        self._buffer = bytearray()
+        self._out = bytearray()
+        self._hello: Hello | None = None
+        self._transcript = b""
+        self._seal_in: Seal | None = None
+        self._seal_out: Seal | None = None
+        self._may_come = _MAY_COME.get((side, self._phase), _NOTHING)
+        self._may_go = _MAY_GO.get((side, self._phase), _NOTHING)
+
+    @property
+    def state(self) -> State:
+        """opening, open, closing or closed."""
+        return _STATES.get(self._phase, State.OPENING)
+
+    def _enter(self, phase: _Phase) -> None:
+        self._phase = phase
+        self._may_come = _MAY_COME.get((self.side, phase), _NOTHING)
+        self._may_go = _MAY_GO.get((self.side, phase), _NOTHING)
+
+    def data_to_send(self) -> bytes:
+        """Bytes that the handshake itself has to send; ask after each `receive_data`."""
+        data = bytes(self._out)
+        self._out.clear()
+        return data
+
+    def send(self, message: Message) -> bytes:
+        """Bytes of a message. Raises ProtocolError if it is too large or may not be sent now; then nothing has changed."""
+        kind = message.KIND
+        if kind not in self._may_go:
+            raise ProtocolError("out_of_turn", f"{type(message).__name__} cannot be sent while {self._phase.value}")
+        if self._phase is not _Phase.OPEN:
+            return self._send_opening(message)
+        data = self._frame(encode(message))
+        if kind in _LAST:
+            self._enter(_Phase.CLOSING)
+        return data
+
+    def _frame(self, body: bytes) -> bytes:
+        if self._seal_out is None:
+            return len(body).to_bytes(_HEADER, "big") + body
+        return (len(body) + SEAL_BYTES).to_bytes(_HEADER, "big") + body + self._seal_out.next(body)
+
+    def _send_opening(self, message: Message) -> bytes:
+        if isinstance(message, Hello):
+            message = replace(message, auth=self._nonce if self._key is not None else b"")
+            body = encode(message)
+            self._transcript = body
+            self._enter(_Phase.HELLO_SENT)
+        elif isinstance(message, Welcome):
+            body = self._welcome_body(message)
+        else:
+            body = encode(message)
+            self._enter(_Phase.CLOSING)
+        data = self._frame(body)
+        if isinstance(message, Welcome):
+            self._open(message.version)
+        return data
+
+    def _welcome_body(self, welcome: Welcome) -> bytes:
+        if self._key is None:
+            return encode(welcome)
+        # `auth` is the last field, so everything but its 32 bytes is covered without encoding twice on the other side.
+        body = encode(replace(welcome, auth=bytes(PROOF_BYTES)))[:-PROOF_BYTES]
+        return body + proof(self._key, "server", self._transcript + body)
+
+    def _open(self, version: int) -> None:
+        self.version = version
+        if self._key is not None:
+            labels = ("client to server", "server to client")
+            mine, theirs = labels if self.side is Side.CLIENT else labels[::-1]
+            self._seal_out = Seal(self._key, mine, self._transcript)
+            self._seal_in = Seal(self._key, theirs, self._transcript)
+        self._enter(_Phase.OPEN)
+
+    def receive_data(self, data: bytes) -> list[Message]:
+        """Messages completed by these bytes, in order.
+
+        Raises ProtocolError when the other side broke the protocol: the connection is closed then, and what came well
+        before the fault is in the error's `before`.
+        """
+        messages: list[Message] = []
+        if self._phase in (_Phase.CLOSING, _Phase.CLOSED):
+            return messages
+        buffer = self._buffer
+        buffer += data
+        start = 0
+        try:
+            while self.state is not State.CLOSED and (end := self._frame_end(start)):
+                message = self._take(bytes(buffer[start + _HEADER : end]))
+                start = end
+                if message is not None:
+                    messages.append(message)
+        except ProtocolError as fault:
+            self._enter(_Phase.CLOSED)
+            buffer.clear()
+            raise ProtocolError(fault.code, fault.text, messages) from None
+        del buffer[:start]
+        return messages
+
+    def _frame_end(self, start: int) -> int:
+        """Where the frame that begins at `start` ends; 0 if it is not there yet. Refuses a bad one as early as it can."""
+        buffer = self._buffer
+        have = len(buffer) - start - _HEADER
+        if have < 0:
+            return 0
+        length = int.from_bytes(buffer[start : start + _HEADER], "big")
+        sealed = SEAL_BYTES if self._seal_in is not None else 0
+        if length < 2 + sealed:
+            raise ProtocolError("malformed", f"a frame of {length} bytes")
+        if have >= 2:
+            kind = kind_of(buffer[start + _HEADER : start + _HEADER + 2])
+            if kind not in self._may_come:
+                raise ProtocolError("out_of_turn", f"kind {kind} cannot come while {self._phase.value}")
+            if length > LIMITS[kind] + sealed:
+                raise ProtocolError("too_large", f"kind {kind}: {length} bytes are above the limit of {LIMITS[kind]}")
+        return start + _HEADER + length if have >= length else 0
+
+    def _take(self, body: bytes) -> Message | None:
+        seal = self._seal_in
+        if seal is not None:
+            body, tag = body[:-SEAL_BYTES], body[-SEAL_BYTES:]
+            if not same(tag, seal.next(body)):
+                raise ProtocolError("bad_seal", "a frame was changed, repeated, lost or made without the key")
+        message = decode(body)
+        if self._phase is not _Phase.OPEN:
+            return self._take_opening(message, body)
+        if message.KIND in _LAST:
+            self._enter(_Phase.CLOSED)
+        return message
+
+    def _take_opening(self, message: Message, body: bytes) -> Message | None:
+        if isinstance(message, Hello):
+            return self._take_hello(message, body)
+        if isinstance(message, Challenge):
+            self._take_challenge(message, body)
+            return None
+        if isinstance(message, Proof):
+            return self._take_proof(message)
+        if isinstance(message, Welcome):
+            self._take_welcome(message, body)
+            return message
+        self._enter(_Phase.CLOSED)
+        return message
+
+    def _take_hello(self, hello: Hello, body: bytes) -> Hello | None:
+        if negotiate(hello.oldest_version, hello.newest_version) is None:
+            spoken = f"{OLDEST_VERSION} to {NEWEST_VERSION}"
+            asked = f"{hello.oldest_version} to {hello.newest_version}"
+            raise ProtocolError(
+                "version", f"versions {asked} are asked for, {spoken} are spoken here: update the older side"
+            )
+        self._transcript = body
+        if self._key is None:
+            if hello.auth:
+                raise ProtocolError(
+                    "no_key_here", "this side has no key: give it the same key file, or take yours away"
+                )
+            self._enter(_Phase.DECIDING)
+            return hello
+        if len(hello.auth) != NONCE_BYTES:
+            raise ProtocolError("key_needed", "this side asks for a key: give the other side the same key file")
+        self._hello = hello
+        challenge = encode(Challenge(self._nonce))
+        self._transcript += challenge
+        self._out += self._frame(challenge)
+        self._enter(_Phase.CHALLENGED)
+        return None
+
+    def _take_challenge(self, challenge: Challenge, body: bytes) -> None:
+        if self._key is None:
+            raise ProtocolError("key_needed", "the server asks for a key: give this side the same key file")
+        if len(challenge.auth) != NONCE_BYTES:
+            raise ProtocolError("malformed", f"a nonce of {len(challenge.auth)} bytes")
+        self._transcript += body
+        self._out += self._frame(encode(Proof(proof(self._key, "client", self._transcript))))
+        self._enter(_Phase.PROVED)
+
+    def _take_proof(self, given: Proof) -> Hello | None:
+        if self._key is None or not same(given.auth, proof(self._key, "client", self._transcript)):
+            raise ProtocolError("wrong_key", "the client's key is not this side's key: use the same key file")
+        self._enter(_Phase.DECIDING)
+        return self._hello
+
+    def _take_welcome(self, welcome: Welcome, body: bytes) -> None:
+        if self._key is not None:
+            if self._phase is not _Phase.PROVED:
+                raise ProtocolError("no_key_there", "the server did not ask for the key: give it the same key file")
+            expected = proof(self._key, "server", self._transcript + body[:-PROOF_BYTES])
+            if not same(welcome.auth, expected):
+                raise ProtocolError("wrong_key", "the server's key is not this side's key: use the same key file")
+        if not OLDEST_VERSION <= welcome.version <= NEWEST_VERSION:
+            raise ProtocolError("version", f"the server chose version {welcome.version}, which was not offered")
+        self._open(welcome.version)
