@@ -1,0 +1,257 @@
+"""Where everything is: the location file services.toml as immutable data, read by every host and by the coordinator."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from services.comm import directory_file
+from services.comm.party import TICK, Envelope
+
+MEMORY = "memory"
+MEMORY_CALLS = ("memory.get", "memory.put", "memory.compare_and_set", "memory.list")
+"""What the node that has the global memory offers."""
+
+
+class DirectoryError(Exception):
+    """services.toml is refused, or it does not know a name; `faults` holds one line for each fault, with its remedy."""
+
+    def __init__(self, faults: tuple[str, ...]) -> None:
+        super().__init__("\n".join(faults))
+        self.faults = faults
+
+
+@dataclass(frozen=True, slots=True)
+class NodeEntry:
+    """A node: one process (with its workers) at one address. `sim` marks the simulated laboratory's."""
+
+    name: str
+    host: str
+    port: int
+    sim: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceEntry:
+    """A device: its node, its driver ("module:Class"; empty on a simulated node) and the driver's own keys."""
+
+    name: str
+    node: str
+    driver: str
+    config: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class ActionEntry:
+    """A primitive action: the primitive task that it translates, its place and its limits (s)."""
+
+    name: str
+    run: str
+    """Import path, "module:function"."""
+    task: str
+    node: str
+    device: str = ""
+    """Empty for an action that needs none."""
+    args: Mapping[str, Any] = field(default_factory=dict)
+    """Arguments that every call gets unless it says otherwise."""
+    deadline: float | None = None
+    orphan_time: float | None = None
+    """How long a run outlives its coordinator's connection; None: without limit."""
+    on_resume: str = "rejoin"
+    """What a resumed coordinator does with it: rejoin, error or ask."""
+    compute_time: float = 0.0
+    """Simulated time of computing in lock step: the result is so much later."""
+    at_once: bool = False
+    """Starts also while an earlier run of its device is still stopping (such as hold)."""
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceEntry:
+    """A general-purpose service. `run` is empty for the global memory and for what a simulated node answers itself."""
+
+    name: str
+    node: str
+    run: str = ""
+    local: bool = False
+    """Only callers on the node's own host may call it."""
+
+
+@dataclass(frozen=True, slots=True)
+class StreamEntry:
+    """A set-point stream: the device that receives it and the period at which it is sent (s)."""
+
+    name: str
+    to: str
+    period: float
+
+
+@dataclass(frozen=True, slots=True)
+class TimerEntry:
+    """A timer that raises the external pulse event of its name with this period (s)."""
+
+    name: str
+    node: str
+    period: float
+
+
+@dataclass(frozen=True, slots=True)
+class Directory:
+    """All of services.toml. The mappings keep the order of the file."""
+
+    source: Path
+    hash: str
+    """SHA-256 of the file's data (comments and spacing left out), in the handshake of every connection."""
+    nodes: Mapping[str, NodeEntry]
+    devices: Mapping[str, DeviceEntry]
+    actions: Mapping[str, ActionEntry]
+    services: Mapping[str, ServiceEntry]
+    streams: Mapping[str, StreamEntry]
+    timers: Mapping[str, TimerEntry]
+    links: Mapping[str, float]
+    """Lock-step delays (s) by "source -> target", endpoint, channel or "default"."""
+    keys: Mapping[str, str]
+    parameters: Mapping[str, str]
+    """Files of numbers that the cell's programs share, by name; relative to this file."""
+
+    def where(self, name: str) -> str:
+        """The node of an action, service, device, stream's receiver or timer. Raises DirectoryError."""
+        if name in self.streams:
+            return self.devices[self.streams[name].to].node
+        key = MEMORY if name in MEMORY_CALLS else name
+        for table in (self.actions, self.services, self.devices, self.timers):
+            if key in table:
+                return str(table[key].node)
+        known = [*self.actions, *self.services, *self.devices, *self.timers, *self.streams]
+        raise DirectoryError((f"{self.source}: nothing is named {name!r}{directory_file.nearest(key, known)}",))
+
+    def offers(self, node: str) -> tuple[str, ...]:
+        """Names of all actions and services that a node answers to."""
+        actions = [a.name for a in self.actions.values() if a.node == node]
+        for service in self.services.values():
+            if service.node == node:
+                actions += MEMORY_CALLS if service.name == MEMORY else [service.name]
+        return tuple(actions)
+
+    def alternatives(self, task: str) -> tuple[str, ...]:
+        """The primitive actions that translate a primitive task, in the order of the file."""
+        return tuple(a.name for a in self.actions.values() if a.task == task)
+
+    def address(self, node: str) -> tuple[str, int]:
+        """Host and port of a node."""
+        entry = self.nodes[node]
+        return entry.host, entry.port
+
+    def local(self, service: str) -> bool:
+        """Whether only callers of the same host may call it."""
+        key = MEMORY if service in MEMORY_CALLS else service
+        return key in self.services and self.services[key].local
+
+    def file(self, path: str) -> Path:
+        """A path written in services.toml, taken relative to it."""
+        return self.source.parent / path
+
+    def delay(self, envelope: Envelope) -> float:
+        """Lock step: how long an envelope is on its way (s), by the most specific entry of `[links]`; at least a tick."""
+        pair = f"{envelope.source} -> {envelope.target}"
+        for key in (pair, envelope.source, envelope.target, envelope.channel, "default"):
+            if key in self.links:
+                return self.links[key]
+        return TICK
+
+
+def load(path: str | Path) -> Directory:
+    """Read services.toml. Raises DirectoryError with every fault in it, OSError when it cannot be read."""
+    source = Path(path)
+    return parse(source.read_text(encoding="utf-8"), source)
+
+
+def parse(text: str, source: Path) -> Directory:
+    """Read the text of a services.toml; `source` is its path, for messages and for relative paths."""
+    tables, digest, faults = directory_file.read(text, str(source), MEMORY)
+    if faults:
+        raise DirectoryError(tuple(faults))
+    devices = {n: _device(n, t) for n, t in tables["devices"].items()}
+    return Directory(
+        source=source,
+        hash=digest,
+        nodes={n: NodeEntry(n, **t) for n, t in tables["nodes"].items()},
+        devices=devices,
+        actions={n: _action(n, t, devices) for n, t in tables["actions"].items()},
+        services={n: _service(n, t) for n, t in tables["services"].items()},
+        streams={n: StreamEntry(n, t["to"], float(t["period"])) for n, t in tables["streams"].items()},
+        timers={n: TimerEntry(n, t["node"], float(t["period"])) for n, t in tables["timers"].items()},
+        links={n: float(d) for n, d in tables["links"].items()},
+        keys=dict(tables["keys"]),
+        parameters=dict(tables["parameters"]),
+    )
+
+
+def _device(name: str, table: Mapping[str, Any]) -> DeviceEntry:
+    config = {key: value for key, value in table.items() if key not in ("node", "driver")}
+    return DeviceEntry(name, table["node"], table.get("driver", ""), config)
+
+
+def _action(name: str, table: Mapping[str, Any], devices: Mapping[str, DeviceEntry]) -> ActionEntry:
+    device = table.get("device", "")
+    orphan_time = table.get("orphan_time", 1.0 if device else None)
+    return ActionEntry(
+        name=name,
+        run=table["run"],
+        task=table["task"],
+        node=devices[device].node if device else table["node"],
+        device=device,
+        args=table.get("args", {}),
+        deadline=_seconds(table.get("deadline")),
+        orphan_time=_seconds(orphan_time),
+        on_resume=table.get("on_resume", "rejoin"),
+        compute_time=float(table.get("compute_time", 0.0)),
+        at_once=table.get("start", "when_stopped") == "at_once",
+    )
+
+
+def _service(name: str, table: Mapping[str, Any]) -> ServiceEntry:
+    return ServiceEntry(name, table["node"], table.get("run", ""), table.get("scope", "network") == "local")
+
+
+def _seconds(value: float | None) -> float | None:
+    return None if value is None else float(value)
+
+
+def verify_imports(directory: Directory, node: str) -> tuple[str, ...]:
+    """Faults of the import paths that a node of this host must load: one line each, empty when all are there."""
+    places = [(f"devices.{d.name}.driver", d.driver) for d in directory.devices.values() if d.node == node and d.driver]
+    places += [(f"actions.{a.name}.run", a.run) for a in directory.actions.values() if a.node == node]
+    places += [(f"services.{s.name}.run", s.run) for s in directory.services.values() if s.node == node and s.run]
+    found = [(key, _import_fault(path)) for key, path in places]
+    return tuple(f"{directory.source}: {key}: {fault}" for key, fault in found if fault)
+
+
+def _import_fault(path: str) -> str:
+    try:
+        resolve(path)
+    except ImportError as fault:
+        return str(fault)
+    return ""
+
+
+def resolve(path: str) -> Any:
+    """The object at an import path "module:name". Raises ImportError that says what is missing and what to do."""
+    module_name, _, attribute = path.partition(":")
+    try:
+        module = importlib.import_module(module_name)
+    except ImportError as fault:
+        raise ImportError(
+            f"cannot import {module_name!r} ({fault}); install its package on this host or put its folder on PYTHONPATH"
+        ) from fault
+    except Exception as fault:
+        raise ImportError(
+            f"importing {module_name!r} raises {type(fault).__name__}: {fault}; mend the module"
+        ) from fault
+    found = getattr(module, attribute, None)
+    if not callable(found):
+        names = [n for n in vars(module) if not n.startswith("_")]
+        raise ImportError(f"{module_name!r} has no callable {attribute!r}{directory_file.nearest(attribute, names)}")
+    return found

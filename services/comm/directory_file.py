@@ -1,0 +1,273 @@
+"""Reads the text of services.toml and names every fault in it, with line, key and remedy."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import json
+import re
+import tomllib
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+SCHEMA = 1
+Tables = dict[str, dict[str, Any]]
+
+
+class Key(NamedTuple):
+    """What one key of a table may hold: a sentence for people, and the check."""
+
+    wants: str
+    fits: Callable[[Any], bool]
+    required: bool = False
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """A hint that names the nearest known name, else all of them when there are few."""
+    names = list(dict.fromkeys(known))
+    close = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
+    if close:
+        return f"; did you mean {close[0]!r}?"
+    return f"; known: {', '.join(names)}" if 0 < len(names) <= 12 else ""
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and value == value and abs(value) < 1e9
+
+
+def _text(value: Any) -> bool:
+    return isinstance(value, str) and bool(value)
+
+
+def _one_of(*choices: str) -> Key:
+    return Key("one of " + ", ".join(f'"{c}"' for c in choices), lambda v: v in choices)
+
+
+_IMPORT_PATH = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
+_NAME = re.compile(r"[A-Za-z_][\w-]*")
+
+
+def _path_key(what: str, *, required: bool = False) -> Key:
+    return Key(
+        f'an import path "module:{what}"', lambda v: isinstance(v, str) and bool(_IMPORT_PATH.fullmatch(v)), required
+    )
+
+
+def _name_key(what: str, *, required: bool = False) -> Key:
+    return Key(f"the name of {what}", _text, required)
+
+
+_POSITIVE = Key("a number of seconds above 0", lambda v: _number(v) and v > 0)
+_NOT_NEGATIVE = Key("a number of seconds, 0 or more", lambda v: _number(v) and v >= 0)
+_PERIOD = _POSITIVE._replace(required=True)
+
+SHAPES: Mapping[str, Mapping[str, Key]] = {
+    "nodes": {
+        "host": Key('a host name or address such as "127.0.0.1"', _text, True),
+        "port": Key(
+            "a port from 1 to 65535", lambda v: isinstance(v, int) and not isinstance(v, bool) and 0 < v < 65536, True
+        ),
+        "sim": Key("true or false", lambda v: isinstance(v, bool)),
+    },
+    "devices": {"node": _name_key("a node", required=True), "driver": _path_key("Class")},
+    "actions": {
+        "run": _path_key("function", required=True),
+        "task": _name_key("the primitive task that the action translates", required=True),
+        "device": _name_key("a device"),
+        "node": Key("the name of one node", _text),
+        "args": Key("a table of arguments", lambda v: isinstance(v, dict)),
+        "deadline": _POSITIVE,
+        "orphan_time": _NOT_NEGATIVE,
+        "on_resume": _one_of("rejoin", "error", "ask"),
+        "compute_time": _NOT_NEGATIVE,
+        "start": _one_of("when_stopped", "at_once"),
+    },
+    "services": {
+        "node": _name_key("a node", required=True),
+        "run": _path_key("function"),
+        "scope": _one_of("network", "local"),
+    },
+    "streams": {"to": _name_key("the device that receives it", required=True), "period": _PERIOD},
+    "timers": {"node": _name_key("a node", required=True), "period": _PERIOD},
+}
+OPEN = ("devices",)
+"""Tables whose entries have keys of their own beside the known ones."""
+FLAT: Mapping[str, Key] = {
+    "links": Key("a delay in seconds, 0.004 (one tick) or more", lambda v: _number(v) and v >= 0.004),
+    "keys": Key("a text", _text),
+    "parameters": Key("the path of a file, relative to this one", _text),
+}
+TOP = ("schema", *SHAPES, *FLAT)
+
+
+class Faults:
+    """Collects faults as lines "FILE:LINE: KEY: what is wrong; remedy"."""
+
+    def __init__(self, text: str, source: str) -> None:
+        self._lines = text.splitlines()
+        self._source = source
+        self.lines: list[str] = []
+
+    def add(self, key: str, fault: str) -> None:
+        """Note a fault of a key given as "table.name.key"."""
+        line = self._line(key.split("."))
+        place = f"{self._source}:{line}" if line else self._source
+        self.lines.append(f"{place}: {key}: {fault}")
+
+    def _line(self, path: list[str]) -> int:
+        """Line of the key, of its table where the key is missing, or 0."""
+        header, wanted, inside = 0, "", len(path) == 1
+        for number, raw in enumerate(self._lines, 1):
+            line = raw.strip()
+            opened = re.fullmatch(r"\[+\s*([^\]]+?)\s*\]+\s*(#.*)?", line)
+            if opened:
+                wanted = ".".join(part.strip().strip("\"'") for part in opened[1].split("."))
+                inside = wanted in (".".join(path[:-1]), ".".join(path[:-2]))
+                if wanted == ".".join(path) or (inside and not header):
+                    header = number
+                if wanted == ".".join(path):
+                    return number
+            elif inside and re.match(rf"[\"']?{re.escape(path[-1])}[\"']?\s*=", line):
+                return number
+        return header
+
+
+def read(text: str, source: str, memory: str) -> tuple[Tables, str, list[str]]:
+    """Tables of the file, the hash of its data, and all faults (then the tables are not to be used)."""
+    faults = Faults(text, source)
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as fault:
+        return {}, "", [_syntax_fault(source, str(fault))]
+    _check_top(data, faults)
+    tables: Tables = {name: data.get(name, {}) for name in (*SHAPES, *FLAT)}
+    for name in tables:
+        if not isinstance(tables[name], dict):
+            faults.add(name, f"is not a table; write [{name}]")
+            tables[name] = {}
+    for table, shape in SHAPES.items():
+        tables[table] = dict(_entries(table, shape, tables[table], faults))
+    for table, key in FLAT.items():
+        for name, value in tables[table].items():
+            if not key.fits(value):
+                faults.add(f"{table}.{name}", f"is {value!r}; write {key.wants}")
+    if not faults.lines:
+        _check_places(tables, faults, memory)
+        _check_names(tables, faults)
+    return tables, _digest(data), faults.lines
+
+
+def _digest(data: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(data, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def _syntax_fault(source: str, text: str) -> str:
+    place = re.search(r"\(at line (\d+)", text)
+    line = f":{place[1]}" if place else ""
+    twice = re.search(r"Cannot declare \('(\w+)', '([^']+)'\) twice", text)
+    if twice:
+        return (
+            f"{source}{line}: {twice[1]}.{twice[2]}: is placed twice; "
+            "each name stands on one node only: remove one of the two tables or rename it"
+        )
+    return f"{source}{line}: not valid TOML: {text}; mend this line"
+
+
+def _check_top(data: Mapping[str, Any], faults: Faults) -> None:
+    for name in data:
+        if name not in TOP:
+            faults.add(name, f"unknown table{nearest(name, TOP)}")
+    schema = data.get("schema")
+    if schema != SCHEMA:
+        known = "is missing" if schema is None else f"is {schema!r}"
+        faults.add("schema", f"{known}; write schema = {SCHEMA}, the layout that this version reads")
+    if not data.get("nodes"):
+        faults.add("nodes", "there is no node; write at least one [nodes.NAME] with host and port")
+
+
+def _entries(
+    table: str, shape: Mapping[str, Key], entries: Mapping[str, Any], faults: Faults
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    for name, entry in entries.items():
+        here = f"{table}.{name}"
+        if not isinstance(entry, dict):
+            faults.add(here, f"is not a table; write [{table}.NAME] above its keys")
+            continue
+        if not _NAME.fullmatch(name):
+            faults.add(here, "a name has letters, digits, _ and - only, and starts with a letter")
+        for key, value in entry.items():
+            _check_key(f"{here}.{key}", key, value, shape, table in OPEN, faults)
+        for key, spec in shape.items():
+            if spec.required and key not in entry:
+                faults.add(f"{here}.{key}", f"is missing; write {spec.wants}")
+        yield name, entry
+
+
+def _check_key(here: str, key: str, value: Any, shape: Mapping[str, Key], open_: bool, faults: Faults) -> None:
+    if key in shape:
+        if not shape[key].fits(value):
+            faults.add(here, f"is {value!r}; write {shape[key].wants}")
+    elif not open_:
+        faults.add(here, f"unknown key{nearest(key, shape)}")
+
+
+def _check_places(tables: Tables, faults: Faults, memory: str) -> None:
+    nodes, devices = tables["nodes"], tables["devices"]
+    _check_addresses(nodes, faults)
+    for table in ("devices", "services", "timers"):
+        for name, entry in tables[table].items():
+            _check_node(f"{table}.{name}.node", entry["node"], nodes, faults)
+    for name, entry in devices.items():
+        node = nodes.get(entry["node"], {})
+        if "driver" not in entry and node and not node.get("sim", False):
+            faults.add(f"devices.{name}.driver", 'is missing; write an import path "module:Class"')
+    for name, entry in tables["services"].items():
+        node = nodes.get(entry["node"], {})
+        if "run" not in entry and name != memory and node and not node.get("sim", False):
+            faults.add(f"services.{name}.run", f'is missing; write an import path (only "{memory}" is built in)')
+    for name, entry in tables["streams"].items():
+        if entry["to"] not in devices:
+            faults.add(f"streams.{name}.to", f"no device is named {entry['to']!r}{nearest(entry['to'], devices)}")
+    for name, entry in tables["actions"].items():
+        _check_action(f"actions.{name}", entry, tables, faults)
+
+
+def _check_node(key: str, node: str, nodes: Mapping[str, Any], faults: Faults) -> None:
+    if node not in nodes:
+        faults.add(key, f"no node is named {node!r}{nearest(node, nodes)}")
+
+
+def _check_addresses(nodes: Mapping[str, Any], faults: Faults) -> None:
+    taken: dict[tuple[str, int], str] = {}
+    for name, entry in nodes.items():
+        address = (entry["host"], entry["port"])
+        if address in taken:
+            where = f"{address[0]}:{address[1]}"
+            faults.add(f"nodes.{name}.port", f"{where} is already node {taken[address]!r}'s; give each its own port")
+        taken.setdefault(address, name)
+
+
+def _check_action(here: str, entry: Mapping[str, Any], tables: Tables, faults: Faults) -> None:
+    nodes, devices = tables["nodes"], tables["devices"]
+    device, node = entry.get("device"), entry.get("node")
+    if node is not None:
+        _check_node(f"{here}.node", node, nodes, faults)
+    if device is None and node is None:
+        faults.add(here, 'is on no node; write device = "..." (it runs where its device is) or node = "..."')
+    elif device is not None and device not in devices:
+        faults.add(f"{here}.device", f"no device is named {device!r}{nearest(device, devices)}")
+    elif device is not None and node is not None and devices[device]["node"] != node:
+        home = devices[device]["node"]
+        faults.add(
+            f"{here}.node", f"is on two nodes: its device {device!r} is on {home!r}, node says {node!r}; remove node"
+        )
+
+
+def _check_names(tables: Tables, faults: Faults) -> None:
+    """Endpoints share one name space: messages are addressed by name, wherever it is."""
+    owner: dict[str, str] = {}
+    for table in SHAPES:
+        for name in tables[table]:
+            if name in owner:
+                faults.add(f"{table}.{name}", f"the name is taken by {owner[name]}.{name}; rename one of them")
+            owner.setdefault(name, table)

@@ -1,0 +1,153 @@
+"""One run of an action: its coroutine, the phase that it is in, and the CPU time that it took."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import time
+from collections.abc import Callable, Coroutine, Mapping
+from dataclasses import dataclass
+from enum import Enum, auto
+from functools import partial
+from typing import Any
+
+from services.action import Cancelled, Result, Wait
+from services.callables import describe
+from services.comm.directory import ActionEntry
+from services.context import RunContext
+from services.runs import Begin
+
+STEPS = 10_000
+"""How often a coroutine may go on without time passing before it is taken for an endless loop."""
+
+
+class Phase(Enum):
+    """Where a run is between its begin and its end."""
+
+    NEW = auto()
+    RUNNING = auto()
+    COMPUTED = auto()
+    """Its result waits for the declared computing time."""
+    STOPPING = auto()
+    """Its coroutine cleans up after a cancel."""
+    SETTLING = auto()
+    """Its coroutine is over; its device must come to a standstill."""
+
+
+class Returned(Exception):  # noqa: N818 - not an error
+    """The action is over; `value` is what it returned."""
+
+    def __init__(self, value: Any) -> None:
+        super().__init__()
+        self.value = value
+
+
+@dataclass(eq=False)
+class Execution:
+    """State of one run; times in seconds on the cell's clock."""
+
+    begin: Begin
+    entry: ActionEntry
+    phase: Phase = Phase.NEW
+    context: RunContext | None = None
+    coroutine: Coroutine[Wait, None, Any] | None = None
+    wait: Wait | None = None
+    started: float = 0.0
+    limit: float | None = None
+    """When the phase is over at the latest."""
+    ready_at: float = 0.0
+    """When its computed result is out."""
+    cpu: float = 0.0
+    result: Result | None = None
+    cause: str = ""
+    text: str = ""
+    abandoned: bool = False
+    """The action could not bring its device to a safe state itself: standing still is not enough."""
+    stop_called: bool = False
+
+    @property
+    def over(self) -> bool:
+        """Whether the action's own code has nothing more to do."""
+        return self.coroutine is None
+
+    def due(self) -> float | None:
+        """When it is worth a look without anything coming in (s)."""
+        if self.phase is Phase.NEW:
+            return -math.inf
+        times = [self.limit, self.wait.due if self.wait else None]
+        if self.phase is Phase.COMPUTED:
+            times.append(self.ready_at)
+        return min((t for t in times if t is not None), default=None)
+
+    def call(self, function: Callable[..., Any], arguments: Mapping[str, Any]) -> None:
+        """Call the action up to its first wait. Raises Returned when it is over, else whatever it raised."""
+        returned = self._timed(lambda: function(self.context, **arguments))
+        if not inspect.iscoroutine(returned):
+            raise Returned(returned)
+        self.coroutine = returned
+        self.go_on(None)
+
+    def look(self, now: float) -> None:
+        """Let it go on if what it waits for is there or its time is over. Raises as `call` does."""
+        if self.wait is None:
+            return
+        try:
+            over = self.wait.ready() or (self.wait.due is not None and now >= self.wait.due)
+        except Exception as fault:
+            self.go_on(fault)
+            return
+        if over:
+            self.go_on(None)
+
+    def go_on(self, throw: BaseException | None) -> None:
+        """Run until it waits for something that is not there yet; `throw` is raised at its wait. Raises as `call` does."""
+        for _ in range(STEPS):
+            self.wait = self._resume(throw)
+            throw = None
+            if not self.wait.ready():
+                return
+        raise RuntimeError(f"went on {STEPS} times without time passing")
+
+    def _resume(self, throw: BaseException | None) -> Wait:
+        coroutine = self.coroutine
+        assert coroutine is not None
+        for _ in range(STEPS):
+            try:
+                step = partial(coroutine.send, None) if throw is None else partial(coroutine.throw, throw)
+                wait: Any = self._timed(step)
+            except StopIteration as returned:
+                self.coroutine = self.wait = None
+                raise Returned(returned.value) from None
+            if isinstance(wait, Wait):
+                return wait
+            throw = TypeError(f"awaits a {type(wait).__name__}; an action awaits only what its context gives it")
+        raise RuntimeError("awaits only what its context did not give it")
+
+    def close(self) -> str:
+        """End the coroutine for good; what it raised instead of ending, empty if it did not."""
+        coroutine, self.coroutine, self.wait = self.coroutine, None, None
+        try:
+            if coroutine is not None:
+                coroutine.close()
+        except (Exception, SystemExit, Cancelled) as fault:
+            return describe(fault)
+        return ""
+
+    def note(self, text: str) -> None:
+        """Add to the text of its end."""
+        self.text = f"{self.text}; {text}" if self.text else text
+
+    def postpone(self, pause: float) -> None:
+        """Move all its times by an operator's pause."""
+        self.started += pause
+        self.ready_at += pause
+        self.limit = None if self.limit is None else self.limit + pause
+        if self.wait is not None and self.wait.due is not None:
+            self.wait.due += pause
+
+    def _timed(self, function: Callable[[], Any]) -> Any:
+        before = time.process_time()
+        try:
+            return function()
+        finally:
+            self.cpu += time.process_time() - before

@@ -1,0 +1,66 @@
+"""The sending ends of set-point streams: newest value wins, paced by absolute deadline, repeated while its run stands by it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from services.runs import Sent
+
+SLACK = 1e-6  # s: binary fractions of a period must not cost a whole tick
+
+
+@dataclass
+class _Outlet:
+    period: float
+    run: str = ""
+    values: tuple[float, ...] = ()
+    published: float = 0.0
+    next: float = -math.inf
+    """Earliest time of the next send."""
+
+
+class Outlets:
+    """All streams that the runs of one place may send to; a machine: `publish`, `advance`, `due`."""
+
+    def __init__(self, periods: Mapping[str, float]) -> None:
+        self._outlets = {name: _Outlet(period) for name, period in periods.items()}
+        self._open: dict[str, _Outlet] = {}
+
+    def publish(self, now: float, run: str, stream: str, values: Sequence[float]) -> None:
+        """Make `values` the newest of a stream. Raises ValueError for an unknown stream or numbers that are not finite."""
+        outlet = self._outlets.get(stream)
+        if outlet is None:
+            raise ValueError(f"no stream is named {stream!r}; services.toml has: {', '.join(self._outlets) or 'none'}")
+        numbers = tuple(float(v) for v in values)
+        if not all(map(math.isfinite, numbers)):
+            raise ValueError(f"set point of {stream!r} is not finite: {numbers}")
+        outlet.run, outlet.values, outlet.published = run, numbers, now
+        self._open[stream] = outlet
+
+    def withdraw(self, stream: str, run: str | None = None) -> None:
+        """Stop standing by a stream's last value (only if it is that run's, when one is given)."""
+        if stream in self._open and run in (None, self._open[stream].run):
+            del self._open[stream]
+
+    def close(self, run: str) -> None:
+        """A run ended: nobody stands by its set points any more."""
+        for stream in [s for s, outlet in self._open.items() if outlet.run == run]:
+            del self._open[stream]
+
+    def advance(self, now: float) -> list[Sent]:
+        """What is to be sent now: of each open stream at most one value in a period, new or repeated."""
+        sent = []
+        for stream, outlet in self._open.items():
+            if now + SLACK < outlet.next:
+                continue
+            late = now - outlet.next
+            # absolute deadlines keep the rate; after a gap of more than a period the grid starts anew
+            outlet.next = (outlet.next if late < outlet.period else now) + outlet.period
+            sent.append(Sent(stream, outlet.values, now - outlet.published))
+        return sent
+
+    def due(self) -> float | None:
+        """When `advance` has something to send next (s), None if nothing is open."""
+        return min((outlet.next for outlet in self._open.values()), default=None)

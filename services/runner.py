@@ -1,0 +1,273 @@
+"""Runs actions: a machine that polls their coroutines, cancels them, holds them to their deadlines and guards their device."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+from services.action import Cancelled, Result, Status
+from services.callables import check_arguments, describe
+from services.comm.directory import ActionEntry, resolve
+from services.comm.messages import Executed
+from services.comm.plain import plain
+from services.context import RunContext
+from services.execution import Execution, Phase, Returned
+from services.outlets import Outlets
+from services.runs import Answered, Begin, Ended, Hold, Order, Report, Stop
+
+GRACE = 0.5
+"""Seconds that a cancelled action has to clean up and its device to stand still before the stop routine is called."""
+STOP_LIMIT = 2.0
+"""Seconds after the stop routine when the run ends although its device is not known to stand still; the device stays fenced."""
+_AFTER = (Phase.STOPPING, Phase.SETTLING)
+_FAULTS = (Exception, SystemExit, Cancelled)
+
+
+class DeviceControl(Protocol):
+    """A device as the runner guards it."""
+
+    @property
+    def handle(self) -> Any:
+        """What actions see as `ctx.device`."""
+
+    def stop(self, now: float) -> None:
+        """Call the stop routine."""
+
+    def stopped(self) -> bool:
+        """Whether the device is known to stand still and has taken all commands."""
+
+
+class Runner:
+    """Runs of one place: of one device, at most one at a time (besides those that start at once), or of none, any number.
+
+    Orders come in by `take`, reports go out by `reports`; in between `advance(now)` does what is due. `clock` is what
+    `ctx.now` reads. `substitutes` replace actions by other callables. With `virtual` the declared computing time passes.
+    """
+
+    def __init__(
+        self,
+        actions: Mapping[str, ActionEntry],
+        *,
+        clock: Callable[[], float],
+        device: DeviceControl | None = None,
+        streams: Mapping[str, float] | None = None,
+        substitutes: Mapping[str, Callable[..., Any]] | None = None,
+        virtual: bool = False,
+    ) -> None:
+        self._actions = actions
+        self._clock = clock
+        self._device = device
+        self._outlets = Outlets(streams or {})
+        self._callables: dict[str, Callable[..., Any]] = dict(substitutes or {})
+        self._virtual = virtual
+        self._runs: dict[str, Execution] = {}
+        self._reports: list[Report] = []
+        self._fenced = False
+        self._held_since: float | None = None
+
+    @property
+    def runs(self) -> tuple[str, ...]:
+        """Ids of the runs that have not ended."""
+        return tuple(self._runs)
+
+    @property
+    def fenced(self) -> bool:
+        """Whether the device is not known to stand still after a run that had to be given up."""
+        return self._fenced
+
+    def load(self, action: str) -> Callable[..., Any]:
+        """The callable of an action, imported once. Raises ImportError."""
+        if action not in self._callables:
+            self._callables[action] = resolve(self._actions[action].run)
+        return self._callables[action]
+
+    def take(self, now: float, order: Order) -> None:
+        """Take an order. A run begins at the next `advance`."""
+        if isinstance(order, Begin):
+            self._begin(order)
+        elif isinstance(order, Stop):
+            if order.id in self._runs:
+                self._stop(now, self._runs[order.id], order.cause, order.text)
+        elif isinstance(order, Answered):
+            any(run.context.answer(order) for run in self._runs.values() if run.context)
+        elif isinstance(order, Hold):
+            self._hold(now, order.frozen)
+
+    def reports(self) -> list[Report]:
+        """What happened since the last call, in order."""
+        reports, self._reports = self._reports, []
+        return reports
+
+    def due(self) -> float | None:
+        """When `advance` has something to do at the latest (s), None if only something that comes in can matter."""
+        held = self._held_since is not None
+        times = [] if held else [self._outlets.due()]
+        times += [run.due() for run in self._runs.values() if not held or run.phase in _AFTER]
+        return min((t for t in times if t is not None), default=None)
+
+    def advance(self, now: float) -> None:
+        """Do all that is due: begin, go on, stop, end."""
+        if self._fenced and self._device is not None and self._device.stopped():
+            self._fenced = False
+        held = self._held_since is not None
+        for run in list(self._runs.values()):
+            if not held and run.phase not in _AFTER:
+                self._lead(now, run)
+            if run.phase is Phase.STOPPING:
+                self._clean_up(now, run)
+            if run.phase is Phase.SETTLING:
+                self._settle(now, run)
+        if not held:
+            self._reports += self._outlets.advance(now)
+
+    # --- begin -------------------------------------------------------------------------------------------------------
+
+    def _begin(self, begin: Begin) -> None:
+        entry = self._actions.get(begin.action)
+        if begin.id in self._runs:
+            return
+        if entry is None:
+            self._refuse(begin, "unknown_service", f"no action {begin.action!r} here")
+        elif self._fenced and not entry.at_once:
+            self._refuse(begin, "fenced", "the device is not known to stand still after an earlier run")
+        elif busy := self._taken_by(entry):
+            self._refuse(begin, "busy", f"the device is taken by run {busy}")
+        else:
+            self._runs[begin.id] = Execution(begin, entry)
+
+    def _taken_by(self, entry: ActionEntry) -> str:
+        if self._device is None:
+            return ""
+        return next((i for i, run in self._runs.items() if not (entry.at_once and run.phase in _AFTER)), "")
+
+    def _refuse(self, begin: Begin, cause: str, text: str) -> None:
+        self._reports.append(Ended(begin.id, Status.ERROR, {}, cause, text, Executed.NO))
+
+    def _drop(self, run: Execution, cause: str, text: str) -> None:
+        del self._runs[run.begin.id]
+        self._refuse(run.begin, cause, text)
+
+    def _start(self, now: float, run: Execution) -> None:
+        begin, entry = run.begin, run.entry
+        try:
+            function = self.load(begin.action)
+            arguments = plain({**entry.args, **begin.arguments}, "arguments")
+            check_arguments(function, arguments)
+        except ImportError as fault:
+            self._drop(run, "import_failed", f"{entry.run}: {fault}")
+            return
+        except (TypeError, ValueError) as fault:
+            self._drop(run, "bad_arguments", f"{begin.action}: {fault}")
+            return
+        handle = self._device.handle if self._device else None
+        run.context = RunContext(begin, handle, self._clock, self._outlets, self._reports.append)
+        run.phase, run.started = Phase.RUNNING, now
+        run.limit = None if begin.deadline is None else now + begin.deadline
+        self._in_action(now, run, lambda: run.call(function, arguments))
+
+    # --- go on -------------------------------------------------------------------------------------------------------
+
+    def _lead(self, now: float, run: Execution) -> None:
+        if run.phase is Phase.NEW:
+            self._start(now, run)
+        elif run.limit is not None and now >= run.limit:
+            self._stop(now, run, "deadline", f"not over after {run.begin.deadline:g} s")
+        elif run.phase is Phase.RUNNING:
+            self._in_action(now, run, lambda: run.look(now))
+        elif run.result is not None and now >= run.ready_at - 1e-9:
+            self._end(now, run, run.result)
+
+    def _in_action(self, now: float, run: Execution, step: Callable[[], None]) -> None:
+        """Let the action's own code go on, and take what comes of it."""
+        try:
+            step()
+        except Returned as returned:
+            self._returned(now, run, returned.value)
+        except _FAULTS as fault:
+            run.close()
+            if run.phase is not Phase.STOPPING:
+                self._give_up(now, run, "exception", describe(fault))
+            elif not isinstance(fault, Cancelled):
+                run.note(f"while it cleaned up: {describe(fault)}")
+        if run.phase is Phase.STOPPING and run.over:
+            run.phase = Phase.SETTLING
+
+    def _returned(self, now: float, run: Execution, returned: Any) -> None:
+        if run.phase is Phase.STOPPING:
+            return
+        if not isinstance(returned, Result):
+            name = type(returned).__name__
+            self._give_up(now, run, "bad_result", f"returned a {name}; return success(), failure() or error()")
+            return
+        try:
+            values = plain(returned.values, "result")
+            result = Result(Status(returned.status), values, str(returned.cause), str(returned.text))
+        except (TypeError, ValueError) as fault:
+            self._give_up(now, run, "bad_result", str(fault))
+            return
+        if self._virtual and run.entry.compute_time > 0:
+            run.phase, run.result, run.ready_at = Phase.COMPUTED, result, now + run.entry.compute_time
+        else:
+            self._end(now, run, result)
+
+    # --- end ---------------------------------------------------------------------------------------------------------
+
+    def _give_up(self, now: float, run: Execution, cause: str, text: str) -> None:
+        """The action broke: nobody leads its device any more, so the stop routine comes at once."""
+        run.phase, run.cause, run.text, run.abandoned, run.limit = Phase.SETTLING, cause, text, True, now
+        self._settle(now, run)
+
+    def _stop(self, now: float, run: Execution, cause: str, text: str) -> None:
+        if run.phase is Phase.NEW:
+            self._drop(run, cause, text)
+        elif run.phase not in _AFTER:
+            run.cause, run.text, run.result, run.limit = cause, text, None, now + GRACE
+            self._outlets.close(run.begin.id)
+            run.phase = Phase.SETTLING if run.over else Phase.STOPPING
+            if not run.over:
+                self._in_action(now, run, lambda: run.go_on(Cancelled(cause)))
+
+    def _clean_up(self, now: float, run: Execution) -> None:
+        assert run.limit is not None
+        if now < run.limit:
+            self._in_action(now, run, lambda: run.look(now))
+            return
+        run.phase, run.abandoned = Phase.SETTLING, True
+        if fault := run.close():
+            run.note(f"did not let itself be closed: {fault}")
+
+    def _settle(self, now: float, run: Execution) -> None:
+        """End the run when its device stands still; call the stop routine when its grace is over."""
+        assert run.limit is not None
+        self._outlets.close(run.begin.id)
+        failed = Result(Status.ERROR, {}, run.cause, run.text)
+        if self._device is None or (self._device.stopped() and (run.stop_called or not run.abandoned)):
+            self._end(now, run, failed)
+        elif now < run.limit:
+            return
+        elif not run.stop_called:
+            run.stop_called, run.limit = True, now + STOP_LIMIT
+            self._device.stop(now)
+        else:
+            self._fenced = True
+            run.note("the device is not known to stand still")
+            self._end(now, run, Result(Status.ERROR, {}, run.cause, run.text))
+
+    def _end(self, now: float, run: Execution, result: Result) -> None:
+        identity = run.begin.id
+        self._outlets.close(identity)
+        del self._runs[identity]
+        took = now - run.started
+        self._reports.append(
+            Ended(identity, result.status, result.values, result.cause, result.text, Executed.YES, took, run.cpu)
+        )
+
+    def _hold(self, now: float, frozen: bool) -> None:
+        """Freeze the runs, or let them go on with all their times moved by the pause."""
+        if frozen:
+            self._held_since = now if self._held_since is None else self._held_since
+        elif self._held_since is not None:
+            pause, self._held_since = now - self._held_since, None
+            for run in self._runs.values():
+                if run.phase in (Phase.RUNNING, Phase.COMPUTED):
+                    run.postpone(pause)
