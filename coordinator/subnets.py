@@ -1,0 +1,82 @@
+"""Macro places: a task with every macro place replaced by its subnet, names prefixed with the macro place's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from coordinator.conditions import rename
+from coordinator.task import End, Input, Kind, Output, Place, Subnet, Task, Transition
+
+
+def expand(task: Task) -> Task:
+    """The flat task. Raises ValueError on subnets that contain themselves; other faults are for `consistency.faults`."""
+    places: dict[str, Place] = {}
+    transitions: dict[str, Transition] = {}
+    entries: dict[str, Subnet] = {}
+    _unfold(task, "", task.places, task.transitions, (), places, transitions, entries)
+    rewired = {name: _rewire(t, entries) for name, t in transitions.items()}
+    return replace(task, places=places, transitions=rewired, subnets={})
+
+
+def _unfold(
+    task: Task,
+    prefix: str,
+    new_places: Mapping[str, Place],
+    new_transitions: Mapping[str, Transition],
+    inside: tuple[str, ...],
+    places: dict[str, Place],
+    transitions: dict[str, Transition],
+    entries: dict[str, Subnet],
+) -> None:
+    """Add the places and transitions under a prefix, and those of the macro places among them."""
+    for place in new_places.values():
+        name = prefix + place.name
+        if place.kind is not Kind.MACRO:
+            places[name] = replace(place, name=name)
+            continue
+        if place.subnet in inside:
+            raise ValueError(f"subnet {place.subnet!r} contains itself by {' > '.join((*inside, place.subnet))}")
+        subnet = task.subnets[place.subnet]
+        entries[name] = subnet
+        _unfold(
+            task, f"{name}.", subnet.places, subnet.transitions, (*inside, place.subnet), places, transitions, entries
+        )
+    for transition in new_transitions.values():
+        transitions[prefix + transition.name] = _prefixed(transition, prefix, new_places) if prefix else transition
+
+
+def _prefixed(transition: Transition, prefix: str, siblings: Mapping[str, Place]) -> Transition:
+    when = transition.when
+    if when is not None:
+        when = rename(when, {n: prefix + n for n in when.names if n.rpartition(".")[0] in siblings})
+    return replace(
+        transition,
+        name=prefix + transition.name,
+        when=when,
+        inputs=tuple(replace(a, place=prefix + a.place) for a in transition.inputs),
+        outputs=tuple(replace(a, place=prefix + a.place) for a in transition.outputs),
+        inhibitors=tuple(replace(a, place=prefix + a.place) for a in transition.inhibitors),
+    )
+
+
+def _rewire(transition: Transition, entries: Mapping[str, Subnet]) -> Transition:
+    """The transition with its arcs to and from macro places bent to the subnets' entry and exit places."""
+    return replace(
+        transition,
+        inputs=tuple(_from(a, entries) for a in transition.inputs),
+        outputs=tuple(_to(a, entries) for a in transition.outputs),
+    )
+
+
+def _to(arc: Output, entries: Mapping[str, Subnet]) -> Output:
+    while arc.place in entries:
+        arc = replace(arc, place=f"{arc.place}.{entries[arc.place].entry}")
+    return arc
+
+
+def _from(arc: Input, entries: Mapping[str, Subnet]) -> Input:
+    if arc.place not in entries:
+        return arc
+    subnet = entries[arc.place]
+    return replace(arc, place=f"{arc.place}.{subnet.error if arc.end is End.ERROR else subnet.normal}", end=None)

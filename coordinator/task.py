@@ -1,0 +1,393 @@
+"""The robotic task model: primitive tasks, places, transitions, events and variables as immutable records.
+
+A task is one interpreted Petri net (paper, sections 2 and 5) together with what its places and transitions mean. `Task.net`
+is its ordinary net (docs/semantics.md, section 8): events, conditions, priorities, weights and times dropped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from functools import cached_property
+from typing import Any
+
+from coordinator.conditions import Expression
+from coordinator.net import Net
+
+Value = Any
+"""Plain data: None, bool, int, float, str, or lists and string-keyed mappings of them."""
+
+
+class Status(StrEnum):
+    """How a run ended (paper, section 4)."""
+
+    SUCCESS = "success"
+    FAILURE = "failure"
+    ERROR = "error"
+
+
+class Executed(StrEnum):
+    """Whether a run that ended in ERROR touched the world."""
+
+    YES = "yes"
+    NO = "no"
+    UNKNOWN = "unknown"
+
+
+class Kind(StrEnum):
+    """What a place stands for."""
+
+    ACTION = "action"
+    """A primitive task: a token in it is a run of one of its actions."""
+    RESOURCE = "resource"
+    """Something that runs share: an arm, a camera."""
+    CONTROL = "control"
+    """Task flow alone; the operator may put tokens in and take them out."""
+    MACRO = "macro"
+    """A whole subnet drawn as one place."""
+
+
+class End(StrEnum):
+    """When an arc out of an action place may take the token."""
+
+    NORMAL = "normal"
+    """The run is done with SUCCESS or FAILURE."""
+    ERROR = "error"
+    """The run is done with ERROR."""
+    PREEMPT = "preempt"
+    """The run still goes on; it is cancelled."""
+    GOING = "going"
+    """The run still goes on and keeps going on: the token is only looked at."""
+
+
+class Counts(StrEnum):
+    """How a preempted run counts in its action's estimates."""
+
+    SUCCESS = "success"
+    FAILURE = "failure"
+    ERROR = "error"
+    NONE = "none"
+    """Censored: it says nothing about reliability, only that it had lasted so long."""
+
+
+class Scope(StrEnum):
+    """Who detects an event (paper, section 2)."""
+
+    INTERNAL = "internal"
+    """A primitive task raises it while its run goes on; it is latched to that run and gone with it."""
+    EXTERNAL = "external"
+    """A sensor, a timer, another node or the operator."""
+
+
+class Memory(StrEnum):
+    """How long an external event is remembered."""
+
+    PULSE = "pulse"
+    """It serves the transitions that are enabled when it comes, then it is gone."""
+    LATCHED = "latched"
+    """A flag that stays set until a firing consumes it."""
+
+
+class Early(StrEnum):
+    """What becomes of a latched event that comes before any transition waits for it."""
+
+    DROP = "drop"
+    """It is recorded and forgotten: nothing stale fires later."""
+    KEEP = "keep"
+    """Its flag is set and waits."""
+
+
+class Start(StrEnum):
+    """Whether a run waits until its device is free."""
+
+    WHEN_FREE = "when_free"
+    AT_ONCE = "at_once"
+    """For actions such as hold, which must begin although another run on the device has not stopped yet."""
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """What the designer expects of runs that end with one status, until runs have been measured."""
+
+    share: float
+    """Probability of the status."""
+    mean: float
+    """Mean duration (s)."""
+    cv: float = 1.0
+    """Standard deviation of the duration over its mean; 1 is an exponential law."""
+
+
+@dataclass(frozen=True, slots=True)
+class PrimitiveTask:
+    """A step of the task with a goal of its own, translated into one of several primitive actions (paper, section 2)."""
+
+    name: str
+    goal: str
+    alternatives: tuple[str, ...]
+    """Names of actions; with more than one, a selector chooses at each start."""
+    deadline: float
+    """Seconds that a run may take before the runtime ends it with ERROR, cause `deadline`."""
+    specification: str = ""
+    target_reliability: float = 0.9
+    """R_d of docs: cost is taken in the hardest scenario whose reliability is not below it."""
+    cost: str = "wall"
+    """`wall` or `cpu` (s), or `value:NAME`: a number of that name in the action's result."""
+    error_causes: Mapping[str, str] = field(default_factory=dict)
+    """Cause codes that its actions give with ERROR, with a sentence for people."""
+    start: Start = Start.WHEN_FREE
+    stop_within: float = 2.0
+    """Seconds in which a cancelled run has to stop before its device is stopped and its worker killed."""
+    estimates: Mapping[Status, Estimate] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """An argument that is read from a variable or parameter when the run starts."""
+
+    variable: str
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A place of the net. `x`, `y` are its drawing position (drawing units; y grows downwards)."""
+
+    name: str
+    kind: Kind
+    tokens: int = 0
+    capacity: int | None = None
+    task: str = ""
+    """Action place: its primitive task."""
+    args: Mapping[str, Value] = field(default_factory=dict)
+    """Action place: arguments of the action, plain values or `Reference`s."""
+    out: Mapping[str, str] = field(default_factory=dict)
+    """Action place: which value of the result goes to which variable."""
+    servers: int | None = None
+    """Action place: how many runs go on at once, further tokens queue; None: one, and a second token is a fault."""
+    subnet: str = ""
+    """Macro place: the subnet that it stands for."""
+    label: str = ""
+    x: float | None = None
+    y: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Input:
+    """An arc from a place to a transition. `end` is set exactly on arcs out of action places (and macro places)."""
+
+    place: str
+    weight: int = 1
+    end: End | None = None
+    counts: Counts | None = None
+    """Set exactly on `preempt` arcs."""
+
+
+@dataclass(frozen=True, slots=True)
+class Output:
+    """An arc from a transition to a place."""
+
+    place: str
+    weight: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Inhibitor:
+    """An arc that disables its transition as soon as the place holds `threshold` tokens."""
+
+    place: str
+    threshold: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Transition:
+    """A transition: what it takes and gives, and what must happen for it to fire."""
+
+    name: str
+    inputs: tuple[Input, ...] = ()
+    outputs: tuple[Output, ...] = ()
+    inhibitors: tuple[Inhibitor, ...] = ()
+    events: tuple[str, ...] = ()
+    """All must have occurred; at most one of them a pulse."""
+    when: Expression | None = None
+    priority: int = 0
+    """Settles conflicts only: the highest of a conflict set fires."""
+    weight: float | None = None
+    """Settles conflicts of equal priority by a draw."""
+    after: float | None = None
+    """Fires so many seconds after its arcs became satisfied."""
+    error_branch: bool = False
+    """Said to belong to an error branch; those behind an `error` arc belong there without saying so."""
+    label: str = ""
+    x: float | None = None
+    y: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """A declared event."""
+
+    name: str
+    scope: Scope
+    memory: Memory = Memory.PULSE
+    """External events only; an internal one is always latched to its run."""
+    early: Early = Early.DROP
+    """Latched external events only."""
+    by: str = ""
+    """Internal events only: the primitive task that raises it."""
+    mean_wait: float | None = None
+    """Expected seconds from the moment something waits for it until it comes, for forecasts before any measurement."""
+    text: str = ""
+
+
+class VariableType(StrEnum):
+    """What a variable may hold."""
+
+    BOOL = "bool"
+    INT = "int"
+    FLOAT = "float"
+    STR = "str"
+    ANY = "any"
+    """Any plain data; conditions may compare it with none only."""
+
+    def admits(self, value: Value) -> bool:
+        """Whether the value is of this type (none is of every type: not written yet)."""
+        if value is None or self is VariableType.ANY:
+            return True
+        if isinstance(value, bool):
+            return self is VariableType.BOOL
+        kinds: dict[VariableType, tuple[type, ...]] = {
+            VariableType.INT: (int,),
+            VariableType.FLOAT: (int, float),
+            VariableType.STR: (str,),
+        }
+        return isinstance(value, kinds.get(self, ()))
+
+    @classmethod
+    def of(cls, value: Value) -> VariableType:
+        """The narrowest type that admits the value."""
+        return next(
+            t for t in (cls.ANY if value is None else cls.BOOL, cls.INT, cls.FLOAT, cls.STR, cls.ANY) if t.admits(value)
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Variable:
+    """A global-memory variable that conditions and arguments may read."""
+
+    name: str
+    type: VariableType
+    initial: Value = None
+    values: tuple[str, ...] = ()
+    """A `str` variable's possible values, if they are few: then `check` can prove that conditions cover all cases."""
+
+
+@dataclass(frozen=True, slots=True)
+class Subnet:
+    """A net within the net, used through macro places; its names are prefixed with the macro place's."""
+
+    name: str
+    places: Mapping[str, Place]
+    transitions: Mapping[str, Transition]
+    entry: str
+    """Place that receives the tokens put into the macro place."""
+    normal: str
+    """Place from which arcs `macro:normal` take."""
+    error: str = ""
+    """Place from which arcs `macro:error` take."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A whole robot task. Immutable; `flat` and `net` are derived once."""
+
+    name: str
+    places: Mapping[str, Place]
+    transitions: Mapping[str, Transition]
+    primitive_tasks: Mapping[str, PrimitiveTask]
+    final: Expression
+    """Predicate on markings (names are places): the task has ended as designed."""
+    final_error: Expression | None = None
+    """Predicate on markings: the task has given up honestly and ends in ERROR."""
+    goal: str = ""
+    """What counts as a met specification, for people."""
+    goal_transitions: tuple[str, ...] = ()
+    """Firings that each stand for one met goal (R_goal of the forecasts)."""
+    runs_place: str = ""
+    """Control place whose tokens are the mission runs still to do."""
+    parameters: Mapping[str, Value] = field(default_factory=dict)
+    """Names and defaults of what a user sets for a mission run; read like variables, never written."""
+    variables: Mapping[str, Variable] = field(default_factory=dict)
+    events: Mapping[str, Event] = field(default_factory=dict)
+    subnets: Mapping[str, Subnet] = field(default_factory=dict)
+    prepare: str = ""
+    """Service that is called with the parameters before a mission run; empty: none."""
+    score: str = ""
+    """Service that is called at its end and gives the task's own results; empty: none."""
+    text: str = ""
+
+    @cached_property
+    def flat(self) -> Task:
+        """The task with every macro place replaced by its subnet; itself if there is none."""
+        from coordinator.subnets import expand
+
+        return expand(self) if any(p.kind is Kind.MACRO for p in self.places.values()) else self
+
+    @cached_property
+    def net(self) -> Net:
+        """The ordinary net of the flat task: places, arcs, inhibitors, capacities and initial marking alone.
+
+        Priorities are left out on purpose: they settle conflicts among transitions whose events have come, so as
+        priorities of the ordinary net they would forbid firings that do happen.
+        """
+        flat = self.flat
+        return Net.build(
+            {p.name: p.tokens for p in flat.places.values()},
+            {t.name: (_weights(t.inputs), _produced(t)) for t in flat.transitions.values()},
+            inhibitors={t.name: {i.place: i.threshold for i in t.inhibitors} for t in flat.transitions.values()},
+            capacity={p.name: p.capacity for p in flat.places.values() if p.capacity is not None},
+        )
+
+    @cached_property
+    def error_elements(self) -> frozenset[str]:
+        """Names of places and transitions that only error branches reach (of `self`, macro places unexpanded)."""
+        transitions = {
+            t.name for t in self.transitions.values() if t.error_branch or any(i.end is End.ERROR for i in t.inputs)
+        }
+        places: set[str] = set()
+        while True:
+            new_places = set(self._only_fed_by(transitions)) - places
+            new_transitions = {
+                t.name for t in self.transitions.values() if any(i.place in places | new_places for i in t.inputs)
+            } - transitions
+            if not new_places and not new_transitions:
+                return frozenset(places | transitions)
+            places |= new_places
+            transitions |= new_transitions
+
+    def _only_fed_by(self, transitions: set[str]) -> Iterator[str]:
+        """Places without tokens of their own whose every producer is among the transitions."""
+        for place in self.places.values():
+            feeders = [t.name for t in self.transitions.values() if any(o.place == place.name for o in t.outputs)]
+            if feeders and not place.tokens and transitions.issuperset(feeders):
+                yield place.name
+
+    def primitive_task_of(self, place: str) -> PrimitiveTask:
+        """The primitive task of an action place of the flat task. Raises KeyError."""
+        return self.primitive_tasks[self.flat.places[place].task]
+
+    def initial_variables(self) -> dict[str, Value]:
+        """Variables and parameters before a mission run begins."""
+        return {v.name: v.initial for v in self.variables.values()} | dict(self.parameters)
+
+
+def _weights(arcs: tuple[Input, ...] | tuple[Output, ...]) -> dict[str, int]:
+    return {a.place: a.weight for a in arcs}
+
+
+def _produced(transition: Transition) -> dict[str, int]:
+    """What a transition puts back: its outputs, and the tokens that `going` arcs only look at."""
+    produced = _weights(transition.outputs)
+    for arc in transition.inputs:
+        if arc.end is End.GOING:
+            produced[arc.place] = produced.get(arc.place, 0) + arc.weight
+    return produced

@@ -1,0 +1,30 @@
+"""How faults are worded for people: where, what, and what to do about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from difflib import get_close_matches
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One thing that is wrong: its key (`transitions.start.in`), a sentence, and the remedy."""
+
+    key: str
+    text: str
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.key}: {self.text}" + (f"; {self.remedy}" if self.remedy else "")
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """` (did you mean 'x'?)` when a known word is close, else nothing."""
+    near = get_close_matches(word, list(known), 1)
+    return f" (did you mean {near[0]!r}?)" if near else ""
+
+
+def listed(words: Iterable[str]) -> str:
+    """The words, sorted and separated by commas."""
+    return ", ".join(sorted(words)) or "none"
