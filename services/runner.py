@@ -98,6 +98,9 @@ class Runner:
         reports, self._reports = self._reports, []
         return reports
 
+    def _report(self, report: Report) -> None:
+        self._reports.append(report)
+
     def due(self) -> float | None:
         """When `advance` has something to do at the latest (s), None if only something that comes in can matter."""
         held = self._held_since is not None
@@ -160,7 +163,7 @@ class Runner:
             self._drop(run, "bad_arguments", f"{begin.action}: {fault}")
             return
         handle = self._device.handle if self._device else None
-        run.context = RunContext(begin, handle, self._clock, self._outlets, self._reports.append)
+        run.context = RunContext(begin, handle, self._clock, self._outlets, self._report)
         run.phase, run.started = Phase.RUNNING, now
         run.limit = None if begin.deadline is None else now + begin.deadline
         self._in_action(now, run, lambda: run.call(function, arguments))
@@ -212,10 +215,10 @@ class Runner:
 
     # --- end ---------------------------------------------------------------------------------------------------------
 
-    def _give_up(self, now: float, run: Execution, cause: str, text: str) -> None:
+    @staticmethod
+    def _give_up(now: float, run: Execution, cause: str, text: str) -> None:
         """The action broke: nobody leads its device any more, so the stop routine comes at once."""
         run.phase, run.cause, run.text, run.abandoned, run.limit = Phase.SETTLING, cause, text, True, now
-        self._settle(now, run)
 
     def _stop(self, now: float, run: Execution, cause: str, text: str) -> None:
         if run.phase is Phase.NEW:

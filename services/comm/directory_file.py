@@ -115,21 +115,19 @@ class Faults:
         self.lines.append(f"{place}: {key}: {fault}")
 
     def _line(self, path: list[str]) -> int:
-        """Line of the key, of its table where the key is missing, or 0."""
-        header, wanted, inside = 0, "", len(path) == 1
+        """Line of the key, else of the first header of the table that it belongs to, else 0."""
+        table, wanted, header, first = path[:-1], ".".join(path), "", 0
         for number, raw in enumerate(self._lines, 1):
             line = raw.strip()
-            opened = re.fullmatch(r"\[+\s*([^\]]+?)\s*\]+\s*(#.*)?", line)
-            if opened:
-                wanted = ".".join(part.strip().strip("\"'") for part in opened[1].split("."))
-                inside = wanted in (".".join(path[:-1]), ".".join(path[:-2]))
-                if wanted == ".".join(path) or (inside and not header):
-                    header = number
-                if wanted == ".".join(path):
+            if opened := re.fullmatch(r"\[+\s*([^\]]+?)\s*\]+\s*(#.*)?", line):
+                header = ".".join(part.strip().strip("\"'") for part in opened[1].split("."))
+                if f"{header}.".startswith(f"{wanted}."):
                     return number
-            elif inside and re.match(rf"[\"']?{re.escape(path[-1])}[\"']?\s*=", line):
+                if header == ".".join(table):
+                    first = number
+            elif header == ".".join(table) and re.match(rf"[\"']?{re.escape(path[-1])}[\"']?\s*=", line):
                 return number
-        return header
+        return first
 
 
 def read(text: str, source: str, memory: str) -> tuple[Tables, str, list[str]]:

@@ -1,0 +1,144 @@
+"""Scripted stand-ins for actions (`--mock FILE`): what each run of an action answers, after how long, with which events.
+
+schema = 1
+[actions.locate_ball]            # one rule for all runs ...
+status = "success"
+seconds = 0.2
+values = { point = [1.0, 0.2, 0.6] }
+
+[[actions.catch_ball]]           # ... or one table for each run, cycled
+status = "failure"
+cause = "missed"
+seconds = [0.5, 0.8]             # drawn uniformly, keyed by seed and run
+[[actions.catch_ball]]
+status = "success"
+events = [{ after = 0.1, name = "contact", data = { force = 2.0 } }]
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Awaitable, Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from services.action import Context, Result, Status
+from services.comm.directory_file import nearest
+
+_KEYS = ("status", "seconds", "values", "cause", "text", "events")
+_EVENT_KEYS = ("after", "name", "data")
+
+
+class ScriptError(Exception):
+    """A script file is refused; one line for each fault."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cue:
+    """An event that a scripted run raises, so many seconds after its begin."""
+
+    after: float
+    name: str
+    data: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """What one run does: status, cause and values after a time drawn from `seconds` = (shortest, longest)."""
+
+    status: Status = Status.SUCCESS
+    seconds: tuple[float, float] = (0.0, 0.0)
+    values: Mapping[str, Any] = field(default_factory=dict)
+    cause: str = ""
+    text: str = ""
+    events: tuple[Cue, ...] = ()
+
+
+class Scripted:
+    """A callable action that plays its lines one run after the other, over and over. Takes any arguments."""
+
+    def __init__(self, lines: Iterable[Line]) -> None:
+        self._lines = tuple(lines)
+        self._runs = 0
+
+    def __call__(self, ctx: Context, **_: Any) -> Awaitable[Result]:
+        """Play the next line."""
+        line = self._lines[self._runs % len(self._lines)]
+        self._runs += 1
+        return _play(ctx, line)
+
+
+async def _play(ctx: Context, line: Line) -> Result:
+    begun = ctx.now
+    shortest, longest = line.seconds
+    seconds = shortest if shortest == longest else float(ctx.random("script").uniform(shortest, longest))
+    for cue in sorted(line.events, key=lambda c: c.after):
+        if cue.after > seconds:
+            break
+        await ctx.sleep(begun + cue.after - ctx.now)
+        ctx.raise_event(cue.name, **cue.data)
+    if begun + seconds > ctx.now:
+        await ctx.sleep(begun + seconds - ctx.now)
+    return Result(line.status, line.values, line.cause, line.text)
+
+
+def load(path: str | Path) -> dict[str, Callable[..., Any]]:
+    """Scripted actions by name. Raises ScriptError with every fault of the file, OSError when it cannot be read."""
+    source = Path(path)
+    try:
+        data = tomllib.loads(source.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as fault:
+        raise ScriptError(f"{source}: not valid TOML: {fault}") from fault
+    faults = [f"{source}: {f}" for f in _top_faults(data)]
+    scripted: dict[str, Callable[..., Any]] = {}
+    for name, rule in data.get("actions", {}).items() if not faults else ():
+        try:
+            lines = [_line(table) for table in (rule if isinstance(rule, list) else [rule])]
+            scripted[name] = Scripted(lines)
+        except ValueError as fault:
+            faults.append(f"{source}: actions.{name}: {fault}")
+    if faults:
+        raise ScriptError("\n".join(faults))
+    return scripted
+
+
+def _top_faults(data: Mapping[str, Any]) -> Iterable[str]:
+    if data.get("schema") != 1:
+        yield "schema: write schema = 1"
+    for key in data:
+        if key not in ("schema", "actions"):
+            yield f"{key}: unknown table{nearest(key, ('schema', 'actions'))}"
+    if not isinstance(data.get("actions", {}), dict):
+        yield "actions: write [actions.NAME] tables"
+
+
+def _line(table: Any) -> Line:
+    if not isinstance(table, dict):
+        raise ValueError(f"is {table!r}; write a table with status, seconds, values, cause, text, events")
+    for key in table:
+        if key not in _KEYS:
+            raise ValueError(f"unknown key {key!r}{nearest(key, _KEYS)}")
+    status = table.get("status", "success")
+    if status not in tuple(Status):
+        raise ValueError(f'status is {status!r}; write "success", "failure" or "error"')
+    values = table.get("values", {})
+    if not isinstance(values, dict):
+        raise ValueError(f"values is {values!r}; write a table")
+    cues = tuple(_cue(cue) for cue in table.get("events", ()))
+    cause, text = str(table.get("cause", "")), str(table.get("text", ""))
+    return Line(Status(status), _seconds(table.get("seconds", 0.0)), values, cause, text, cues)
+
+
+def _seconds(value: Any) -> tuple[float, float]:
+    pair = value if isinstance(value, list) else [value, value]
+    numbers = [v for v in pair if isinstance(v, int | float) and not isinstance(v, bool)]
+    if len(pair) != 2 or len(numbers) != 2 or not 0 <= numbers[0] <= numbers[1]:
+        raise ValueError(f"seconds is {value!r}; write a number, or [shortest, longest]")
+    return float(pair[0]), float(pair[1])
+
+
+def _cue(table: Any) -> Cue:
+    if not isinstance(table, dict) or set(table) - set(_EVENT_KEYS) or not isinstance(table.get("name"), str):
+        raise ValueError(f"event {table!r}; write {{ after = seconds, name = text, data = table }}")
+    return Cue(_seconds(table.get("after", 0.0))[0], table["name"], table.get("data", {}))

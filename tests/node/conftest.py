@@ -1,0 +1,108 @@
+"""A clock that a test moves, a device that takes its time to stop, and a runner driven tick by tick."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+
+from services.comm.directory import ActionEntry
+from services.comm.party import TICK
+from services.runner import Runner
+from services.runs import Answered, Begin, Ended, Order, Report
+
+
+@dataclass
+class Clock:
+    """Simulated time, read like a clock."""
+
+    now: float = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@dataclass
+class Device:
+    """A device under test: moves while told to, comes to rest `halting` seconds after its stop routine (None: never)."""
+
+    clock: Clock
+    halting: float | None = 0.1
+    moving: bool = False
+    stops: list[float] = field(default_factory=list)
+
+    @property
+    def handle(self) -> Device:
+        return self
+
+    def stop(self, now: float) -> None:
+        self.stops.append(now)
+
+    def stopped(self) -> bool:
+        if self.moving and self.stops and self.halting is not None and self.clock.now >= self.stops[0] + self.halting:
+            self.moving = False
+        return not self.moving
+
+
+@dataclass
+class Bench:
+    """A runner whose actions are given as callables, driven on a clock of its own."""
+
+    clock: Clock
+    device: Device | None
+    runner: Runner
+    seen: list[Report] = field(default_factory=list)
+    begun: int = 0
+
+    def begin(self, action: str, deadline: float | None = None, seed: int = 1, **arguments: Any) -> str:
+        self.begun += 1
+        identity = f"run{self.begun}"
+        self.runner.take(self.clock.now, Begin(identity, action, arguments, deadline, seed))
+        return identity
+
+    def take(self, order: Order) -> None:
+        self.runner.take(self.clock.now, order)
+
+    def answer(self, child: str, status: str = "success", **values: Any) -> None:
+        self.take(Answered(child, status, values))
+
+    def tick(self, seconds: float = 0.0) -> list[Report]:
+        """Advance now, then tick by tick for so many seconds; gives what was reported."""
+        fresh: list[Report] = []
+        until = self.clock.now + seconds
+        while True:
+            self.runner.advance(self.clock.now)
+            fresh += self.runner.reports()
+            if self.clock.now >= until - 1e-9:
+                break
+            self.clock.now += TICK
+        self.seen += fresh
+        return fresh
+
+    def ended(self, identity: str) -> Ended:
+        """How a run ended; it must have ended once."""
+        (end,) = [r for r in self.seen if isinstance(r, Ended) and r.id == identity]
+        return end
+
+
+@pytest.fixture
+def bench() -> Callable[..., Bench]:
+    """Makes a bench: `bench(name=function, ...)`, with a device if `device=True` or one is given."""
+
+    def make(device: Any = None, virtual: bool = True, limits: dict[str, Any] | None = None, **actions: Any) -> Bench:
+        clock = Clock()
+        owner = Device(clock) if device is True else device
+        if owner is not None:
+            owner.clock = clock
+        entries = {
+            name: ActionEntry(name, "tests:none", "task", "here", "it" if owner else "", **(limits or {}).get(name, {}))
+            for name in actions
+        }
+        runner = Runner(
+            entries, clock=clock, device=owner, streams={"points": 0.02}, substitutes=actions, virtual=virtual
+        )
+        return Bench(clock, owner, runner)
+
+    return make

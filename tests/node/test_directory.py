@@ -1,0 +1,202 @@
+"""services.toml: what it gives, and every fault named with line, key and remedy."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from services.comm.directory import MEMORY_CALLS, Directory, DirectoryError, load, parse, verify_imports
+from services.comm.party import TICK, Envelope
+
+GOOD = """\
+schema = 1
+[parameters]
+cell = "cell.toml"
+[nodes.vision]
+host = "127.0.0.1"
+port = 7301
+[nodes.motion]
+host = "127.0.0.1"
+port = 7302
+[nodes.world]
+host = "127.0.0.1"
+port = 7300
+sim = true
+[devices.eye]
+node = "vision"
+driver = "json:JSONDecoder"
+source = "sim"
+[devices.hand]
+node = "motion"
+driver = "json:JSONEncoder"
+[actions.look]
+run = "json:loads"
+task = "find"
+device = "eye"
+deadline = 5
+[actions.look_twice]
+run = "json:loads"
+task = "find"
+device = "eye"
+args = { times = 2 }
+start = "at_once"
+[actions.add]
+run = "json:dumps"
+task = "sum"
+node = "motion"
+[services.memory]
+node = "vision"
+[services.secret]
+node = "motion"
+run = "json:dumps"
+scope = "local"
+[services.throw]
+node = "world"
+[streams.where]
+to = "hand"
+period = 0.02
+[timers.beat]
+node = "vision"
+period = 0.04
+[links]
+default = 0.008
+image = 0.2
+"look -> world" = 0.4
+"""
+
+
+def good() -> Directory:
+    return parse(GOOD, Path("cell/services.toml"))
+
+
+def test_what_a_good_file_gives() -> None:
+    d = good()
+    assert d.where("look") == "vision" and d.where("add") == "motion" and d.where("where") == "motion"
+    assert d.where("memory.get") == "vision" and d.where("beat") == "vision" and d.where("eye") == "vision"
+    assert d.alternatives("find") == ("look", "look_twice") and d.alternatives("nothing") == ()
+    assert d.offers("vision") == ("look", "look_twice", *MEMORY_CALLS) and d.offers("world") == ("throw",)
+    assert d.devices["eye"].config == {"source": "sim"}
+    assert d.actions["look"].orphan_time == 1.0 and d.actions["add"].orphan_time is None
+    assert d.actions["look"].deadline == 5.0 and d.actions["look_twice"].at_once
+    assert d.local("secret") and not d.local("memory.put") and not d.local("look")
+    assert d.address("motion") == ("127.0.0.1", 7302) and d.nodes["world"].sim
+    assert d.file(d.parameters["cell"]) == Path("cell/cell.toml")
+
+
+def test_hash_is_of_the_data_not_of_the_text() -> None:
+    assert parse("# a comment\n" + GOOD, Path("elsewhere.toml")).hash == good().hash
+    assert parse(GOOD.replace("7301", "7303"), Path("services.toml")).hash != good().hash
+
+
+@pytest.mark.parametrize(
+    ("source", "target", "channel", "delay"),
+    [
+        ("look", "world", "call", 0.4),
+        ("look", "other", "call", 0.008),
+        ("world", "eye", "image", 0.2),
+        ("a", "b", "can", 0.008),
+    ],
+)
+def test_link_delays_by_the_most_specific_entry(source: str, target: str, channel: str, delay: float) -> None:
+    assert good().delay(Envelope("anywhere", source, target, channel, None)) == delay
+
+
+def test_a_link_takes_a_tick_when_nothing_is_said() -> None:
+    bare = parse(GOOD[: GOOD.index("[links]")], Path("services.toml"))
+    assert bare.delay(Envelope("p", "a", "b", "call", None)) == TICK
+
+
+FAULTS = [
+    ("schema = 1", "schema = 2", ":1: schema: is 2; write schema = 1"),
+    ("schema = 1\n", "", "schema: is missing; write schema = 1"),
+    ("[timers.beat]", "[timer.beat]", ":47: timer: unknown table; did you mean 'timers'?"),
+    ("port = 7301", "port = 7302", "127.0.0.1:7302 is already node 'vision''s; give each its own port"),
+    ("port = 7301", "port = 70000", ":6: nodes.vision.port: is 70000; write a port from 1 to 65535"),
+    ("port = 7301", "port = true", ":6: nodes.vision.port: is True; write a port from 1 to 65535"),
+    ("port = 7301\n", "", ":4: nodes.vision.port: is missing; write a port from 1 to 65535"),
+    ("port = 7301", "prot = 7301", "nodes.vision.prot: unknown key; did you mean 'port'?"),
+    ('node = "vision"\ndriver', 'node = "vison"\ndriver', "no node is named 'vison'; did you mean 'vision'?"),
+    ('driver = "json:JSONDecoder"\n', "", 'devices.eye.driver: is missing; write an import path "module:Class"'),
+    ('"json:JSONDecoder"', '"json.JSONDecoder"', 'devices.eye.driver: is \'json.JSONDecoder\'; write an import path'),
+    ('device = "eye"\ndeadline', 'device = "ear"\ndeadline', "actions.look.device: no device is named 'ear'"),
+    ('device = "eye"\ndeadline', "deadline", 'actions.look: is on no node; write device = "..."'),
+    ('device = "eye"\ndeadline', 'device = "eye"\nnode = "motion"\ndeadline', "actions.look.node: is on two nodes"),
+    ('node = "motion"\n[services.m', 'node = ["motion", "vision"]\n[services.m', "write the name of one node"),
+    ("[actions.look_twice]", "[actions.look]", "actions.look: is placed twice; each name stands on one node only"),
+    ("[actions.add]", "[actions.beat]", "timers.beat: the name is taken by actions.beat; rename one of them"),
+    ('task = "sum"\n', "", "actions.add.task: is missing; write the name of the primitive task"),
+    ("deadline = 5", "deadline = 0", ":25: actions.look.deadline: is 0; write a number of seconds above 0"),
+    ("deadline = 5", "deadline = nan", "actions.look.deadline: is nan; write a number of seconds above 0"),
+    ("deadline = 5", "deadlin = 5", "actions.look.deadlin: unknown key; did you mean 'deadline'?"),
+    ("deadline = 5", 'on_resume = "retry"', 'write one of "rejoin", "error", "ask"'),
+    ('start = "at_once"', 'start = "now"', 'write one of "when_stopped", "at_once"'),
+    ('run = "json:dumps"\nscope', "scope", 'services.secret.run: is missing; write an import path (only "memory"'),
+    ('scope = "local"', 'scope = "host"', 'services.secret.scope: is \'host\'; write one of "network", "local"'),
+    ('to = "hand"', 'to = "foot"', "streams.where.to: no device is named 'foot'"),
+    ("period = 0.02", "period = -1", "streams.where.period: is -1; write a number of seconds above 0"),
+    ("period = 0.04\n", "", "timers.beat.period: is missing; write a number of seconds above 0"),
+    ("default = 0.008", "default = 0.001", "links.default: is 0.001; write a delay in seconds, 0.004 (one tick) or more"),
+    ('cell = "cell.toml"', "cell = 3", "parameters.cell: is 3; write the path of a file, relative to this one"),
+    ("[devices.hand]", '[devices."a hand"]', "a name has letters, digits, _ and - only"),
+    ("port = 7301", "port = ", ":6: not valid TOML"),
+    (GOOD, "schema = 1\n", "nodes: there is no node; write at least one [nodes.NAME]"),
+    ("[links]\ndefault = 0.008\nimage", "links = 3\n[links_]\nimage", "links"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "says"), FAULTS)
+def test_faults_are_named_with_their_remedy(old: str, new: str, says: str) -> None:
+    assert old in GOOD
+    with pytest.raises(DirectoryError) as caught:
+        parse(GOOD.replace(old, new, 1), Path("cell/services.toml"))
+    assert says in str(caught.value), str(caught.value)
+    assert all(fault.startswith("cell/services.toml") for fault in caught.value.faults)
+
+
+def test_all_faults_are_told_at_once() -> None:
+    text = GOOD.replace("port = 7301", "port = 0").replace("deadline = 5", "deadline = -5").replace("to =", "too =")
+    with pytest.raises(DirectoryError) as caught:
+        parse(text, Path("services.toml"))
+    assert len(caught.value.faults) == 4  # two numbers, an unknown key, a missing one
+
+
+def test_an_unknown_name_is_answered_with_the_nearest() -> None:
+    with pytest.raises(DirectoryError, match="nothing is named 'lok'; did you mean 'look'"):
+        good().where("lok")
+
+
+def test_an_unreadable_file_raises_what_the_system_says(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        load(tmp_path / "services.toml")
+
+
+@pytest.mark.parametrize(
+    ("path", "says"),
+    [
+        ("json:JSONDecode", "'json' has no callable 'JSONDecode'; did you mean 'JSONDecoder'?"),
+        ("jsonn:loads", "cannot import 'jsonn' (No module named 'jsonn'); install its package on this host"),
+        ("broken_driver:Driver", "importing 'broken_driver' raises ZeroDivisionError: division by zero; mend the module"),
+    ],
+)
+def test_imports_are_verified_on_the_host_that_runs_them(
+    path: str, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "broken_driver.py").write_text("1 / 0\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    directory = parse(GOOD.replace("json:JSONDecoder", path), Path("services.toml"))
+    (fault,) = verify_imports(directory, "vision")
+    assert fault.startswith(f"services.toml: devices.eye.driver: {says}")
+    assert verify_imports(directory, "motion") == ()
+
+
+def test_an_action_in_a_laboratorys_own_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package = tmp_path / "our_laboratory"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "grasp.py").write_text("def grasp(ctx, *, force=1.0): ...\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    directory = parse(GOOD.replace("json:dumps", "our_laboratory.grasp:grasp"), Path("services.toml"))
+    assert verify_imports(directory, "motion") == ()
+    assert "our_laboratory.grasp" in sys.modules
