@@ -1,0 +1,494 @@
+"""The called end of the node protocol for all callers of a node, as a machine: what runs, how it ended, who was told.
+
+Used alike in real time (`server.py` drives it) and in lock step. The node takes its `orders` and reports back with
+`finish`, `feedback`, `raise_event` and `answer`. What it promises:
+
+- A call id is run at most once in the life of this boot: a known id is re-attached or answered from its stored result, one
+  that was acknowledged or forgotten is remembered as an id.
+- Every run ends with one outcome, kept until its caller acknowledges it or `Keeping.results` is over.
+- A run goes on no longer than its deadline, and no longer without its caller than its offer's `orphan_time`.
+- A device takes orders from one caller at a time: the holder of its lease.
+
+Refusals are outcomes with status error and executed = no: unknown_service, local_only, old_epoch, device_leased,
+device_needs_coordinator, cancelled (before it began), and busy from the node's runner. executed = unknown: rebooted (meant
+for another boot), forgotten (its result was kept no longer).
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from services.comm.events import EventBoard
+from services.comm.messages import (
+    Accept,
+    Answer,
+    Bye,
+    Call,
+    Cancel,
+    Command,
+    Event,
+    EventAck,
+    Executed,
+    Feedback,
+    Hello,
+    Message,
+    Outcome,
+    Ping,
+    Pong,
+    Refuse,
+    ResultAck,
+    Subscribe,
+    Welcome,
+)
+from services.comm.plain import NotPlainError, plain
+from services.comm.results import Keeping, ResultStore
+from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION, negotiate
+
+__all__ = ["Callee", "CancelRun", "Commanded", "Inline", "Keeping", "Offer", "Order", "StartRun"]
+
+ERROR: Final = "error"
+COORDINATOR: Final = "coordinator"
+NODE: Final = "node"
+
+Inline = Callable[[float, Call], Outcome]
+"""A service answered on the spot, in the node's loop: (now, call) to outcome. It must neither wait nor compute for long."""
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """An action or service of this node."""
+
+    scope: str = "network"
+    """"network", or "local": for callers on this host alone."""
+    device: str = ""
+    orphan_time: float | None = None
+    """Seconds that a run goes on without its caller; None: for ever."""
+    deadline: float | None = None
+    """Seconds for a call that names none."""
+    inline: Inline | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class StartRun:
+    """Order: begin this run, report back with `finish`."""
+
+    call: Call
+    peer: str
+
+
+@dataclass(frozen=True, slots=True)
+class CancelRun:
+    """Order: stop this run (stop routine first); `finish` still reports its end. Given once a run."""
+
+    id: str
+    reason: str
+    """"cancelled", "deadline" or "orphan", or the caller's own words."""
+
+
+@dataclass(frozen=True, slots=True)
+class Commanded:
+    """Order: carry out a command, report back with `answer`."""
+
+    command: Command
+    peer: str
+
+
+Order = StartRun | CancelRun | Commanded
+
+
+@dataclass(slots=True)
+class _Run:
+    """A run that goes on. `stopping` once it was ordered to stop, `reason` then says why."""
+
+    call: Call
+    peer: str
+    began: float
+    device: str
+    orphan_time: float | None
+    stopping: bool = False
+    reason: str = ""
+
+
+@dataclass(slots=True)
+class _Link:
+    """What is known of a caller, by name."""
+
+    role: str
+    boot: str
+    epoch: int
+    local: bool
+    up: bool = True
+    down_at: float = 0.0
+
+
+class Callee:
+    """What a node offers, to all its callers. `offers` are by name; `boot` is drawn anew at each start of the process.
+
+    Callers are known by their name: one process a name. Raises nothing on what callers do; `finish` and its like raise
+    ValueError when the node itself names a run that does not go on.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        boot: str,
+        offers: Mapping[str, Offer],
+        *,
+        directory: str = "",
+        any_directory: bool = False,
+        keeping: Keeping | None = None,
+    ) -> None:
+        self.name = name
+        self.boot = boot
+        self.offers: Mapping[str, Offer] = dict(offers)
+        self.directory = directory
+        self.any_directory = any_directory
+        self.events = EventBoard()
+        self._keeping = keeping or Keeping()
+        self._links: dict[str, _Link] = {}
+        self._epochs: dict[str, int] = {}
+        self._running: dict[str, _Run] = {}
+        self._results = ResultStore(self._keeping, self.events.forget_run)
+        self._leases: dict[str, str] = {}
+        self._commands: dict[str, str] = {}
+        self._timers: list[tuple[float, str, str]] = []
+        self._orders: list[Order] = []
+        self._messages: list[tuple[str, Message]] = []
+        self._takers: Mapping[type, Callable[[float, str, Any], None]] = {
+            Call: self._take_call,
+            ResultAck: self._take_ack,
+            Cancel: self._take_cancel,
+            Subscribe: self._take_subscribe,
+            EventAck: self._take_event_ack,
+            Command: self._take_command,
+            Ping: self._take_ping,
+            Hello: self._take_hello,
+            Bye: self._take_bye,
+        }
+
+    # Callers come and go.
+
+    def link_up(self, now: float, peer: str, hello: Hello, *, local: bool = True) -> Welcome | Refuse:
+        """A caller has connected (`peer` is its name, `local` whether it lives on this host). Says what to answer it."""
+        refusal = self._refusal_of(peer, hello)
+        if refusal is not None:
+            return refusal
+        self._epochs[peer] = hello.epoch
+        self._links[peer] = _Link(hello.role, hello.boot, hello.epoch, local)
+        self._messages.extend((peer, event) for event in self.events.waiting(peer))
+        version = negotiate(hello.oldest_version, hello.newest_version) or NEWEST_VERSION
+        offers = tuple(name for name, offer in self.offers.items() if local or offer.scope != "local")
+        runs = [id_ for id_, run in self._running.items() if run.peer == peer] + self._results.of(peer)
+        return Welcome(version, self.name, self.boot, offers, tuple(runs), self.directory)
+
+    def _refusal_of(self, peer: str, hello: Hello) -> Refuse | None:
+        if negotiate(hello.oldest_version, hello.newest_version) is None:
+            spoken = f"{OLDEST_VERSION} to {NEWEST_VERSION}"
+            asked = f"{hello.oldest_version} to {hello.newest_version}"
+            return Refuse("version", f"{self.name} speaks versions {spoken}, you {asked}: update the older side")
+        if hello.epoch < self._epochs.get(peer, 0):
+            known = self._epochs[peer]
+            text = f"{peer} has been here with epoch {known}, you come with {hello.epoch}: a newer one has taken over"
+            return Refuse("old_epoch", text)
+        link = self._links.get(peer)
+        if link is not None and link.up and link.boot != hello.boot and hello.epoch <= link.epoch:
+            return Refuse("name_taken", f"another process is connected as {peer}: stop it, or take another name")
+        if hello.directory and self.directory and hello.directory != self.directory and not self.any_directory:
+            text = f"your services.toml ({hello.directory[:12]}) is not {self.name}'s ({self.directory[:12]}): "
+            return Refuse("directory", text + "copy the same file to each host and start its node again")
+        return None
+
+    def link_down(self, now: float, peer: str, *, leaves: bool = False) -> None:
+        """The link of a caller is down; with `leaves` it said good-bye and gives up its leases and subscriptions."""
+        link = self._links.get(peer)
+        if link is None or not link.up:
+            return
+        link.up, link.down_at = False, now
+        self.events.peer_down(peer, leaves)
+        if leaves:
+            self._leases = {device: holder for device, holder in self._leases.items() if holder != peer}
+        for id_, run in self._running.items():
+            if run.peer == peer and run.orphan_time is not None:
+                heapq.heappush(self._timers, (now + run.orphan_time, "orphan", id_))
+
+    # What callers say.
+
+    def receive(self, now: float, peer: str, message: Message) -> None:
+        """Take a message of a caller; kinds that only a client is sent are left alone."""
+        taker = self._takers.get(type(message))
+        if taker is not None:
+            taker(now, peer, message)
+
+    def _take_hello(self, now: float, peer: str, hello: Hello) -> None:
+        self._messages.append((peer, self.link_up(now, peer, hello)))
+
+    def _take_bye(self, now: float, peer: str, bye: Bye) -> None:
+        self.link_down(now, peer, leaves=True)
+
+    def _take_ping(self, now: float, peer: str, ping: Ping) -> None:
+        self._messages.append((peer, Pong(ping.number)))
+
+    def _take_call(self, now: float, peer: str, call: Call) -> None:
+        id_ = call.id
+        if id_ in self._running or id_ in self._results:
+            self._known(peer, id_)
+            return
+        if call.boot and call.boot != self.boot:
+            text = f"this call was meant for another boot of {self.name}"
+            self._messages.append((peer, Outcome(id_, ERROR, {}, "rebooted", text, Executed.UNKNOWN)))
+            return
+        offer = self.offers.get(call.service)
+        refusal = self._refusal_of_call(now, peer, call, offer)
+        if refusal is not None or offer is None:
+            cause, text = refusal or ("unknown_service", "")
+            self._end(now, peer, Outcome(id_, ERROR, {}, cause, text, Executed.NO))
+        elif offer.inline is not None:
+            self._end(now, peer, self._answered(now, offer.inline, call))
+        else:
+            self._start(now, peer, call, offer)
+
+    def _known(self, peer: str, id_: str) -> None:
+        """A call that came before: tell where it stands, never run it again."""
+        run = self._running.get(id_)
+        owner = run.peer if run is not None else self._results.owner(id_)
+        outcome = self._results.get(id_)
+        if owner and owner != peer:
+            text = f"{owner} made a call of this id"
+            self._messages.append((peer, Outcome(id_, ERROR, {}, "id_taken", text, Executed.NO)))
+        elif run is not None:
+            self._messages.append((peer, Accept(id_)))
+        elif outcome is not None:
+            self._messages.append((peer, outcome))
+        else:
+            text = "its result was kept no longer"
+            self._messages.append((peer, Outcome(id_, ERROR, {}, "forgotten", text, Executed.UNKNOWN)))
+
+    def _refusal_of_call(self, now: float, peer: str, call: Call, offer: Offer | None) -> tuple[str, str] | None:
+        """Why this call is not begun: cause and text, None if it is."""
+        link = self._links.get(peer)
+        if link is None or not link.up:
+            return "not_welcome", f"{peer} has not been welcomed by {self.name}"
+        if offer is None:
+            return (
+                "unknown_service",
+                f"{self.name} offers no {call.service}: services.toml places it elsewhere or nowhere",
+            )
+        if call.epoch < link.epoch and link.role == COORDINATOR:
+            return "old_epoch", f"{peer} is at epoch {link.epoch}, the call is of epoch {call.epoch}"
+        if offer.scope == "local" and not link.local:
+            return "local_only", f"{call.service} serves callers on the host of {self.name} alone"
+        return self._lease(now, peer, link, offer.device) if offer.device else None
+
+    def _lease(self, now: float, peer: str, link: _Link, device: str) -> tuple[str, str] | None:
+        """Give the caller the lease of the device, or say why not."""
+        if link.role == NODE:
+            return "device_needs_coordinator", f"{device} takes orders from a coordinator alone, not from node {peer}"
+        holder = self._leases.get(device, peer)
+        if holder != peer and not self._lease_is_free(now, holder, device):
+            return "device_leased", f"{device} takes orders from {holder}"
+        self._leases[device] = peer
+        return None
+
+    def _lease_is_free(self, now: float, holder: str, device: str) -> bool:
+        link = self._links.get(holder)
+        if link is not None and (link.up or now < link.down_at + self._keeping.lease):
+            return False
+        return not any(run.device == device for run in self._running.values())
+
+    @staticmethod
+    def _answered(now: float, inline: Inline, call: Call) -> Outcome:
+        try:
+            return inline(now, call)
+        except Exception as fault:
+            # A fault in a service is its caller's error, not the node's end.
+            text = f"{call.service} failed: {type(fault).__name__}: {fault}"
+            return Outcome(call.id, ERROR, {}, "crashed", text, Executed.UNKNOWN)
+
+    def _start(self, now: float, peer: str, call: Call, offer: Offer) -> None:
+        self._running[call.id] = _Run(call, peer, now, offer.device, offer.orphan_time)
+        deadline = call.deadline if call.deadline is not None else offer.deadline
+        if deadline is not None:
+            heapq.heappush(self._timers, (now + deadline, "deadline", call.id))
+        self._messages.append((peer, Accept(call.id)))
+        self._orders.append(StartRun(call, peer))
+
+    def _take_ack(self, now: float, peer: str, ack: ResultAck) -> None:
+        for id_ in (ack.id, *ack.more):
+            self._results.acknowledge(now, peer, id_)
+
+    def _take_cancel(self, now: float, peer: str, cancel: Cancel) -> None:
+        run = self._running.get(cancel.id)
+        if run is not None:
+            if run.peer == peer:
+                self._stop(cancel.id, run, cancel.reason or "cancelled", "cancelled")
+        elif cancel.id in self._results:
+            self._known(peer, cancel.id)
+        else:
+            # The call itself may still be on its way: remember that it must not begin.
+            self._end(now, peer, Outcome(cancel.id, ERROR, {}, "cancelled", cancel.reason, Executed.NO))
+
+    def _take_subscribe(self, now: float, peer: str, subscribe: Subscribe) -> None:
+        link = self._links.get(peer)
+        if link is not None:
+            waiting = self.events.subscribe(peer, subscribe.names, link.role == COORDINATOR)
+            self._messages.extend((peer, event) for event in waiting)
+
+    def _take_event_ack(self, now: float, peer: str, ack: EventAck) -> None:
+        self.events.acknowledge(peer, ack.source, ack.number)
+
+    def _take_command(self, now: float, peer: str, command: Command) -> None:
+        self._commands[command.id] = peer
+        self._orders.append(Commanded(command, peer))
+
+    # What the node reports.
+
+    def finish(
+        self,
+        now: float,
+        id: str,  # noqa: A002
+        status: str,
+        values: Mapping[str, Any] | None = None,
+        cause: str = "",
+        text: str = "",
+        executed: Executed = Executed.YES,
+        seconds: float | None = None,
+        cpu_seconds: float = 0.0,
+    ) -> Outcome:
+        """A run has ended; gives the outcome its caller is told. `seconds` is taken from the clock when left out.
+
+        One that was stopped by its deadline ends ERROR `deadline` whatever it says; one stopped for another reason keeps
+        its own status if it had ended before. Raises ValueError if no such run goes on.
+        """
+        run = self._running.pop(id, None)
+        if run is None:
+            raise ValueError(f"run {id}: no such run goes on")
+        took = now - run.began if seconds is None else seconds
+        if run.reason == "deadline":
+            text = text or f"it had not ended within its deadline (it ended {status} after {took:.3f} s)"
+            outcome = Outcome(id, ERROR, {}, "deadline", text, executed, took, cpu_seconds)
+        else:
+            if run.stopping and cause == "cancelled":
+                cause, text = run.reason, text or run.call.service
+            outcome = Outcome(id, status, values or {}, cause, text, executed, took, cpu_seconds)
+        outcome = _sendable(outcome)
+        self._end(now, run.peer, outcome)
+        return outcome
+
+    def feedback(self, now: float, id: str, fraction: float, data: Mapping[str, Any] | None = None) -> None:  # noqa: A002
+        """Tell a run's caller how far it is (0 to 1); nothing is kept for one that is away."""
+        run = self._running.get(id)
+        if run is None:
+            raise ValueError(f"run {id}: no such run goes on")
+        self._send(run.peer, Feedback(id, min(max(fraction, 0.0), 1.0), plain(data or {}, "data")))
+
+    def raise_event(
+        self,
+        now: float,
+        name: str,
+        data: Mapping[str, Any] | None = None,
+        *,
+        source: str = "",
+        latched: bool = False,
+        run: str = "",
+    ) -> Event:
+        """Raise an event: of the outside world for whoever subscribed to it, or of a run that goes on, for its caller.
+
+        A latched one is numbered by its source (default: this node) and kept until it is acknowledged.
+        """
+        owner = ""
+        if run:
+            if run not in self._running:
+                raise ValueError(f"run {run}: no such run goes on")
+            owner = self._running[run].peer
+        event = Event(name, source or self.name, 0, plain(data or {}, "data"), run)
+        event, peers = self.events.raise_event(event, latched, owner)
+        for peer in peers:
+            self._send(peer, event)
+        return event
+
+    def answer(self, now: float, id: str, ok: bool, data: Mapping[str, Any] | None = None) -> None:  # noqa: A002
+        """Answer a command."""
+        peer = self._commands.pop(id, None)
+        if peer is None:
+            raise ValueError(f"command {id}: nobody waits for its answer")
+        self._send(peer, Answer(id, ok, plain(data or {}, "data")))
+
+    # What the node takes out.
+
+    def orders(self) -> list[Order]:
+        """What the node has to do, in order; each order is given once."""
+        orders, self._orders = self._orders, []
+        return orders
+
+    def messages(self) -> list[tuple[str, Message]]:
+        """What to send, and to which caller, in order; each message is given once."""
+        messages, self._messages = self._messages, []
+        return messages
+
+    def running(self) -> dict[str, str]:
+        """Runs that go on: service by call id."""
+        return {id_: run.call.service for id_, run in self._running.items()}
+
+    # What time does.
+
+    def advance(self, now: float) -> None:
+        """Stop what is over its deadline or an orphan for too long; forget what was kept long enough."""
+        while self._timers and self._timers[0][0] <= now:
+            due, kind, id_ = heapq.heappop(self._timers)
+            run = self._running.get(id_)
+            if run is not None and (kind == "deadline" or self._is_orphan(run, due)):
+                self._stop(id_, run, kind, kind)
+        self._results.advance(now)
+
+    def _is_orphan(self, run: _Run, now: float) -> bool:
+        link = self._links.get(run.peer)
+        if run.orphan_time is None or (link is not None and link.up):
+            return False
+        return link is None or now >= link.down_at + run.orphan_time
+
+    def due(self) -> float | None:
+        """When `advance` has something to do next (s), None if never."""
+        while self._timers and self._timers[0][2] not in self._running:
+            heapq.heappop(self._timers)
+        results = self._results.due()
+        if not self._timers:
+            return results
+        return self._timers[0][0] if results is None else min(results, self._timers[0][0])
+
+    def _stop(self, id_: str, run: _Run, reason: str, cause: str) -> None:
+        if not run.stopping:
+            run.stopping, run.reason = True, cause
+            self._orders.append(CancelRun(id_, reason))
+
+    def _end(self, now: float, peer: str, outcome: Outcome) -> None:
+        self._results.add(now, peer, outcome)
+        self._send(peer, outcome)
+
+    def _send(self, peer: str, message: Message) -> None:
+        link = self._links.get(peer)
+        if link is None or link.up:
+            self._messages.append((peer, message))
+
+
+def _sendable(outcome: Outcome) -> Outcome:
+    """The outcome in plain data; an ERROR in its place if its values are none."""
+    try:
+        values = plain(outcome.values, "values") if outcome.values else outcome.values
+    except NotPlainError as fault:
+        values, text = {}, f"what it returned cannot be sent: {fault}"
+        return Outcome(
+            outcome.id, ERROR, {}, "bad_result", text, outcome.executed, outcome.seconds, outcome.cpu_seconds
+        )
+    return Outcome(
+        outcome.id,
+        str(outcome.status),
+        values,
+        outcome.cause,
+        outcome.text,
+        outcome.executed,
+        outcome.seconds,
+        outcome.cpu_seconds,
+    )

@@ -1,0 +1,479 @@
+"""The calling end of the node protocol for one peer, as a machine: calls out, how each one ended in.
+
+Used alike in real time (`client.py` drives it) and in lock step (its messages travel in envelopes). What it promises:
+
+- Every call ends with exactly one `Ended`, whatever happens to the link or the peer.
+- No call is ever made again under another id. After a lost link the same call is sent again under the same id to the same
+  boot of the peer, which knows the id and runs it at most once; another boot is never sent it.
+- What the caller decides by itself is ERROR with a cause: executed = no where the call never left, unknown otherwise.
+
+| cause | executed | when |
+|---|---|---|
+| unreachable | no | the peer is away and was not sent the call |
+| refused | no / unknown | the peer refuses the connection |
+| lost | unknown | the link broke and did not come back in time |
+| rebooted | unknown | the peer came back as another boot |
+| not_accepted | unknown | neither ACCEPT nor RESULT in time; cancelled |
+| no_answer | unknown | deadline or cancel long over and no RESULT; cancelled |
+| cancelled | no | cancelled before it left |
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+from services.comm.messages import (
+    Accept,
+    Answer,
+    Bye,
+    Call,
+    Cancel,
+    Command,
+    Event,
+    EventAck,
+    Executed,
+    Feedback,
+    Hello,
+    Message,
+    Outcome,
+    Ping,
+    Pong,
+    Refuse,
+    ResultAck,
+    Subscribe,
+    Welcome,
+)
+from services.comm.notice import (
+    Accepted,
+    Answered,
+    Ended,
+    EventArrived,
+    Late,
+    Notice,
+    PeerBack,
+    PeerLost,
+    Progress,
+)
+from services.comm.plain import plain
+
+__all__ = [
+    "Accepted",
+    "Answered",
+    "Caller",
+    "Ended",
+    "EventArrived",
+    "Late",
+    "Notice",
+    "Patience",
+    "PeerBack",
+    "PeerLost",
+    "Progress",
+]
+
+ERROR = "error"
+_ACKS_AT_ONCE = 64
+_REMEMBERED = 10_000
+_NEVER = float("inf")
+_K = TypeVar("_K")
+_V = TypeVar("_V")
+
+
+@dataclass(frozen=True, slots=True)
+class Patience:
+    """How long the caller waits (s)."""
+
+    reconnect: float = 2.0
+    """After a broken link, before its calls end."""
+    accept: float = 1.0
+    """For ACCEPT."""
+    stop: float = 5.0
+    """For RESULT after the deadline or a cancel: the node's stop routine and kill take time."""
+    answer: float = 2.0
+    """For the answer to a command."""
+    acknowledge: float = 0.05
+    """How long an acknowledgement waits for others to go with it."""
+
+
+@dataclass(slots=True)
+class _Pending:
+    call: Call
+    own_boot: bool
+    """The caller of this machine named the boot himself."""
+    made: float
+    sent: bool = False
+    accepted: bool = False
+    cancel: str | None = None
+    accept_due: float = _NEVER
+    due: float = _NEVER
+
+
+class Caller:
+    """Calls to one peer. `hello` says who calls; its epoch goes into each call that names none.
+
+    With `auto_ack` results and events are acknowledged at once; otherwise the owner says when they are safe.
+    """
+
+    def __init__(self, peer: str, hello: Hello, *, auto_ack: bool = False, patience: Patience | None = None) -> None:
+        self.peer = peer
+        self.hello = hello
+        self.up = False
+        self.boot = ""
+        """Boot of the peer, empty before the first link."""
+        self.offers: tuple[str, ...] = ()
+        self._auto_ack = auto_ack
+        self._patience = patience or Patience()
+        self._refusal = ""
+        self._held_until: float | None = None
+        self._pending: dict[str, _Pending] = {}
+        self._commands: dict[str, float] = {}
+        self._names: tuple[str, ...] | None = None
+        self._settled: dict[str, bool] = {}
+        self._given_up: dict[str, None] = {}
+        self._seen: dict[str, dict[int, None]] = {}
+        self._unsafe: dict[str, set[int]] = {}
+        self._accepts: deque[tuple[float, str]] = deque()
+        self._deadlines: list[tuple[float, str]] = []
+        self._acks: list[str] = []
+        self._acks_due = _NEVER
+        self._messages: list[Message] = []
+        self._notices: list[Notice] = []
+        self._takers: Mapping[type, Callable[[float, Any], None]] = {
+            Outcome: self._take_outcome,
+            Accept: self._take_accept,
+            Feedback: self._take_feedback,
+            Event: self._take_event,
+            Answer: self._take_answer,
+            Welcome: self.link_up,
+            Refuse: self._take_refuse,
+            Bye: self._take_bye,
+            Ping: self._take_ping,
+        }
+
+    # What the owner asks for.
+
+    def open(self, now: float) -> None:
+        """Say HELLO (lock step; in real time the connection does it)."""
+        self._messages.append(self.hello)
+        self._held_until = now + self._patience.reconnect
+
+    def connecting(self, now: float) -> None:
+        """A first connection is being tried: calls made now wait for it as long as for a reconnection."""
+        self._held_until = now + self._patience.reconnect
+
+    def call(self, now: float, call: Call) -> None:
+        """Make a call. Raises ValueError for an id that is under way, NotPlainError for arguments that no message carries."""
+        if call.id in self._pending:
+            raise ValueError(f"call {call.id}: this id is under way already")
+        call = self._stamped(call)
+        pending = _Pending(call, bool(call.boot), now)
+        self._pending[call.id] = pending
+        if self.up:
+            self._send(now, pending)
+        elif self._refusal:
+            self._end(call.id, "refused", self._refusal, Executed.NO)
+        elif self._held_until is None or now >= self._held_until:
+            self._end(call.id, "unreachable", f"{self.peer} is not there", Executed.NO)
+
+    def _stamped(self, call: Call) -> Call:
+        arguments = plain(call.arguments, "arguments") if call.arguments else call.arguments
+        epoch = call.epoch or self.hello.epoch
+        return Call(call.id, call.service, arguments, call.deadline, epoch, call.boot, call.parent, call.seed)
+
+    def cancel(self, now: float, id: str, reason: str = "") -> None:  # noqa: A002
+        """Ask for a call's run to be stopped; it still ends with one `Ended`. An id that is not under way is left alone."""
+        pending = self._pending.get(id)
+        if pending is None or pending.cancel is not None:
+            return
+        if not pending.sent:
+            self._end(id, "cancelled", reason, Executed.NO)
+            return
+        pending.cancel = reason
+        self._watch(pending, min(pending.due, now + self._patience.stop))
+        if self.up:
+            self._messages.append(Cancel(id, reason))
+
+    def cancel_children(self, now: float, parent: str, reason: str = "") -> None:
+        """Cancel all calls made on behalf of this one."""
+        for id_ in [id_ for id_, pending in self._pending.items() if pending.call.parent == parent]:
+            self.cancel(now, id_, reason)
+
+    def command(self, now: float, command: Command) -> None:
+        """Give a node-level order. Raises NotPlainError for data that no message carries."""
+        if not self.up:
+            self._no_answer(command.id, "unreachable")
+            return
+        self._commands[command.id] = now + self._patience.answer
+        self._messages.append(replace(command, data=plain(command.data, "data")))
+
+    def subscribe(self, now: float, names: Iterable[str]) -> None:
+        """Have these events sent from now on, also after each reconnection; replaces an earlier subscription."""
+        self._names = tuple(names)
+        if self.up:
+            self._messages.append(Subscribe(self._names))
+
+    def acknowledge(self, now: float, id: str) -> None:  # noqa: A002
+        """The result of this call is safe; the peer may forget it."""
+        if self._settled.get(id) is False:
+            self._settled[id] = True
+            self._ack(now, id)
+
+    def acknowledge_event(self, now: float, event: Event) -> None:
+        """This event of its source and all before it are safe."""
+        unsafe = self._unsafe.get(event.source, set())
+        if event.number in unsafe:
+            unsafe -= {number for number in unsafe if number <= event.number}
+            if self.up:
+                self._messages.append(EventAck(event.source, event.number))
+
+    def under_way(self) -> tuple[str, ...]:
+        """Ids of the calls that have not ended."""
+        return tuple(self._pending)
+
+    # What happens to the link.
+
+    def link_up(self, now: float, welcome: Welcome) -> None:
+        """The peer welcomed us: what was under way is sent again under its id, or ends if this is another boot."""
+        same = welcome.boot == self.boot
+        self.up, self._refusal, self._held_until = True, "", None
+        self.boot, self.offers = welcome.boot, welcome.offers
+        self._notices.append(PeerBack(welcome.name, welcome.boot, same, welcome.offers, welcome.runs))
+        if not same:
+            self._forget_boot()
+        if self._names is not None:
+            self._messages.append(Subscribe(self._names))
+        for pending in list(self._pending.values()):
+            self._send(now, pending)
+            if pending.cancel is not None:
+                self._messages.append(Cancel(pending.call.id, pending.cancel))
+        self._settle_again(now, welcome.runs)
+
+    def _forget_boot(self) -> None:
+        """The peer is another process now: what the old one was sent is lost, its event numbers begin anew."""
+        self._seen.clear()
+        self._unsafe.clear()
+        for id_, pending in list(self._pending.items()):
+            if pending.sent:
+                self._end(id_, "rebooted", f"{self.peer} was started anew", Executed.UNKNOWN)
+        self._given_up.clear()
+
+    def _settle_again(self, now: float, runs: Iterable[str]) -> None:
+        """Runs that the peer still keeps although they ended here: stop what was given up, acknowledge what was lost."""
+        for id_ in runs:
+            if id_ in self._given_up:
+                self._messages.append(Cancel(id_, "given up"))
+            elif self._settled.get(id_):
+                self._ack(now, id_)
+
+    def link_down(self, now: float, reason: str, *, final: bool = False) -> None:
+        """The link broke. Calls wait for it to come back, unless `final` (the peer was silent for long already)."""
+        if not self.up:
+            return
+        self.up = False
+        self._messages.clear()
+        self._acks.clear()
+        self._acks_due = _NEVER
+        self._notices.append(PeerLost(reason))
+        for id_ in list(self._commands):
+            self._no_answer(id_, "lost")
+        if final:
+            self._end_all("lost", reason)
+        else:
+            self._held_until = now + self._patience.reconnect
+
+    def link_refused(self, now: float, refuse: Refuse) -> None:
+        """The peer refuses us: every call ends, also those to come, until it welcomes us."""
+        was_up, self.up, self._held_until = self.up, False, None
+        self._refusal = f"{self.peer} refuses the connection: {refuse.code}: {refuse.text}"
+        self._messages.clear()
+        if was_up or self._pending or self._commands:
+            self._notices.append(PeerLost(self._refusal))
+        for id_ in list(self._commands):
+            self._no_answer(id_, "refused")
+        self._end_all("refused", self._refusal)
+
+    # What the peer says.
+
+    def receive(self, now: float, message: Message) -> None:
+        """Take a message of the peer; kinds that only a server is sent are left alone."""
+        taker = self._takers.get(type(message))
+        if taker is not None:
+            taker(now, message)
+
+    def _take_outcome(self, now: float, outcome: Outcome) -> None:
+        id_ = outcome.id
+        pending = self._pending.pop(id_, None)
+        if pending is not None:
+            self._settle(id_, self._auto_ack)
+            self._notices.append(Ended(outcome))
+            if self._auto_ack:
+                self._ack(now, id_)
+            return
+        acked = self._settled.get(id_)
+        if acked is None:
+            self._given_up.pop(id_, None)
+            self._settle(id_, True)
+            self._notices.append(Late(outcome))
+        if acked is not False:
+            self._ack(now, id_)
+
+    def _take_accept(self, now: float, accept: Accept) -> None:
+        pending = self._pending.get(accept.id)
+        if pending is None or pending.accepted:
+            return
+        pending.accepted = True
+        self._notices.append(Accepted(accept.id))
+        if pending.call.deadline is not None and pending.cancel is None:
+            self._watch(pending, pending.made + pending.call.deadline + self._patience.stop)
+
+    def _take_feedback(self, now: float, feedback: Feedback) -> None:
+        if feedback.id in self._pending:
+            self._notices.append(Progress(feedback.id, feedback.fraction, feedback.data))
+
+    def _take_event(self, now: float, event: Event) -> None:
+        if event.number:
+            seen = self._seen.setdefault(event.source, {})
+            unsafe = self._unsafe.setdefault(event.source, set())
+            known = event.number in seen
+            if not known:
+                _remember(seen, event.number, None)
+                if not self._auto_ack:
+                    unsafe.add(event.number)
+            if event.number not in unsafe:
+                self._messages.append(EventAck(event.source, event.number))
+            if known:
+                return
+        self._notices.append(EventArrived(event))
+
+    def _take_answer(self, now: float, answer: Answer) -> None:
+        if self._commands.pop(answer.id, None) is not None:
+            self._notices.append(Answered(answer))
+
+    def _take_refuse(self, now: float, refuse: Refuse) -> None:
+        self.link_refused(now, refuse)
+
+    def _take_bye(self, now: float, bye: Bye) -> None:
+        self.link_down(now, bye.text or "it left")
+
+    def _take_ping(self, now: float, ping: Ping) -> None:
+        self._messages.append(Pong(ping.number))
+
+    # What time does.
+
+    def advance(self, now: float) -> None:
+        """End what has waited too long."""
+        if self._held_until is not None and now >= self._held_until:
+            self._held_until = None
+            self._end_all("lost", f"{self.peer} did not come back in {self._patience.reconnect:g} s")
+        while self._accepts and self._accepts[0][0] <= now:
+            self._accept_over(self._accepts.popleft())
+        while self._deadlines and self._deadlines[0][0] <= now:
+            due, id_ = heapq.heappop(self._deadlines)
+            pending = self._pending.get(id_)
+            if pending is not None and pending.due <= due:
+                self._give_up(id_, "no_answer", f"{self.peer} gave no result in time")
+        for id_ in [id_ for id_, due in self._commands.items() if due <= now]:
+            self._no_answer(id_, "no_answer")
+
+    def _accept_over(self, watch: tuple[float, str]) -> None:
+        due, id_ = watch
+        pending = self._pending.get(id_)
+        if pending is not None and not pending.accepted and self.up and pending.accept_due <= due:
+            self._give_up(id_, "not_accepted", f"{self.peer} did not accept it in {self._patience.accept:g} s")
+
+    def due(self) -> float | None:
+        """When `advance` has something to do next (s), None if never."""
+        while self._accepts and self._accepted_or_over(self._accepts[0][1]):
+            self._accepts.popleft()
+        while self._deadlines and self._deadlines[0][1] not in self._pending:
+            heapq.heappop(self._deadlines)
+        times = [self._acks_due] if self._acks else []
+        if self._accepts:
+            times.append(self._accepts[0][0])
+        if self._deadlines:
+            times.append(self._deadlines[0][0])
+        if self._held_until is not None:
+            times.append(self._held_until)
+        if self._commands:
+            times.append(min(self._commands.values()))
+        return min(times) if times else None
+
+    def _accepted_or_over(self, id_: str) -> bool:
+        pending = self._pending.get(id_)
+        return pending is None or pending.accepted
+
+    # What goes out.
+
+    def messages(self, now: float | None = None) -> list[Message]:
+        """What to send, in order; each message is given once. Acknowledgements wait for others until `now` reaches theirs."""
+        acks = self._acks
+        if acks and (len(acks) >= _ACKS_AT_ONCE or now is None or now >= self._acks_due):
+            self._messages.append(ResultAck(acks[0], tuple(acks[1:])))
+            acks.clear()
+        if not self._messages:
+            return []
+        messages, self._messages = self._messages, []
+        return messages
+
+    def notices(self) -> list[Notice]:
+        """What the owner should know, in order; each notice is given once."""
+        if not self._notices:
+            return []
+        notices, self._notices = self._notices, []
+        return notices
+
+    def _send(self, now: float, pending: _Pending) -> None:
+        call = pending.call
+        if not pending.own_boot and call.boot != self.boot:
+            call = replace(call, boot=self.boot)
+            pending.call = call
+        pending.sent = True
+        pending.accepted = False
+        pending.accept_due = now + self._patience.accept
+        self._accepts.append((pending.accept_due, call.id))
+        self._messages.append(call)
+
+    def _watch(self, pending: _Pending, due: float) -> None:
+        pending.due = due
+        heapq.heappush(self._deadlines, (due, pending.call.id))
+
+    def _ack(self, now: float, id_: str) -> None:
+        if not self.up:
+            return
+        if not self._acks:
+            self._acks_due = now + self._patience.acknowledge
+        self._acks.append(id_)
+
+    def _settle(self, id_: str, acked: bool) -> None:
+        _remember(self._settled, id_, acked)
+
+    def _give_up(self, id_: str, cause: str, text: str) -> None:
+        if self.up:
+            self._messages.append(Cancel(id_, cause))
+        self._end(id_, cause, text, Executed.UNKNOWN)
+
+    def _end_all(self, cause: str, text: str) -> None:
+        for id_, pending in list(self._pending.items()):
+            if pending.sent:
+                self._end(id_, cause, text, Executed.UNKNOWN)
+            else:
+                self._end(id_, "unreachable" if cause == "lost" else cause, text, Executed.NO)
+
+    def _end(self, id_: str, cause: str, text: str, executed: Executed) -> None:
+        pending = self._pending.pop(id_)
+        if pending.sent:
+            _remember(self._given_up, id_, None)
+        self._notices.append(Ended(Outcome(id_, ERROR, {}, cause, text, executed)))
+
+    def _no_answer(self, id_: str, cause: str) -> None:
+        self._commands.pop(id_, None)
+        self._notices.append(Answered(Answer(id_, False, {"cause": cause})))
+
+
+def _remember(memory: dict[_K, _V], key: _K, value: _V) -> None:
+    memory[key] = value
+    if len(memory) > _REMEMBERED:
+        del memory[next(iter(memory))]

@@ -1,0 +1,84 @@
+"""What a node remembers of calls that have ended: results until they are acknowledged, ids for longer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from services.comm.messages import Outcome
+
+
+@dataclass(frozen=True, slots=True)
+class Keeping:
+    """How long the node remembers."""
+
+    results: float = 600.0
+    """Seconds that an unacknowledged result is kept,"""
+    result_count: int = 1_000
+    """and how many of them."""
+    ids: float = 3_600.0
+    """Seconds that an id whose result is gone is remembered,"""
+    id_count: int = 200_000
+    """and how many of them."""
+    lease: float = 2.0
+    """Seconds after which the lease of a device is free when its holder is away and none of its runs goes on."""
+
+
+class ResultStore:
+    """Results by call id. `forgotten` is told each id whose result goes."""
+
+    def __init__(self, keeping: Keeping, forgotten: Callable[[str], None]) -> None:
+        self._keeping = keeping
+        self._forgotten = forgotten
+        self._results: dict[str, tuple[Outcome, str, float]] = {}
+        self._ids: dict[str, float] = {}
+
+    def __contains__(self, id_: str) -> bool:
+        return id_ in self._results or id_ in self._ids
+
+    def add(self, now: float, peer: str, outcome: Outcome) -> None:
+        """Keep a result for its caller."""
+        self._results[outcome.id] = (outcome, peer, now)
+        if len(self._results) > self._keeping.result_count:
+            self._forget(now, next(iter(self._results)))
+
+    def get(self, id_: str) -> Outcome | None:
+        """The result of this call, None if it is not kept (any more)."""
+        stored = self._results.get(id_)
+        return None if stored is None else stored[0]
+
+    def owner(self, id_: str) -> str:
+        """Whose result it is; empty if it is not kept."""
+        stored = self._results.get(id_)
+        return "" if stored is None else stored[1]
+
+    def acknowledge(self, now: float, peer: str, id_: str) -> None:
+        """The caller has this result safe; of others' ids nothing is forgotten."""
+        stored = self._results.get(id_)
+        if stored is not None and stored[1] == peer:
+            self._forget(now, id_)
+
+    def of(self, peer: str) -> list[str]:
+        """Ids of the results kept for this caller."""
+        return [id_ for id_, (_, owner, _) in self._results.items() if owner == peer]
+
+    def due(self) -> float | None:
+        """When the oldest result has been kept long enough (s)."""
+        for _, _, at in self._results.values():
+            return at + self._keeping.results
+        return None
+
+    def advance(self, now: float) -> None:
+        """Forget what has been kept long enough."""
+        while (due := self.due()) is not None and due <= now:
+            self._forget(now, next(iter(self._results)))
+
+    def _forget(self, now: float, id_: str) -> None:
+        del self._results[id_]
+        self._ids[id_] = now
+        while self._ids:
+            oldest = next(iter(self._ids))
+            if len(self._ids) <= self._keeping.id_count and self._ids[oldest] + self._keeping.ids > now:
+                break
+            del self._ids[oldest]
+        self._forgotten(id_)
