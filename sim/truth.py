@@ -162,10 +162,6 @@ def rotation_from_vector(vector: Vector) -> Vector:
     return turned
 
 
-_LOOKS_DOWN = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-"""Rows: image x along -y of the base, image y along -x, optical axis down (cell.toml)."""
-
-
 def _camera(
     nominal: Mapping[str, Any], errors: Mapping[str, Any], values: Mapping[str, Any], rng: np.random.Generator
 ) -> CameraTruth:
@@ -175,10 +171,12 @@ def _camera(
     centre = (nominal["width"] - 1) / 2.0, (nominal["height"] - 1) / 2.0
     dx, dy = rng.normal(0.0, errors["camera_principal_px"], 2)
     k1, k2, p1, p2 = np.asarray(nominal["distortion"]) * (1.0 + rng.normal(0.0, errors["camera_distortion"], 4))
+    right, forward = np.asarray(nominal["image_x"], dtype=float), np.array([0.0, 0.0, -1.0])
+    looks_down = np.array([right, np.cross(forward, right), forward])
     later = rotation_from_vector(np.asarray(values["camera_turn"], dtype=float))
     return CameraTruth(
         position=position + np.asarray(values["camera_shift"], dtype=float),
-        rotation=later @ rotation_from_vector(turn) @ _LOOKS_DOWN,
+        rotation=later @ rotation_from_vector(turn) @ looks_down,
         focal_px=float(focal),
         principal_px=(centre[0] + float(dx), centre[1] + float(dy)),
         distortion=(float(k1), float(k2), float(p1), float(p2)),
