@@ -1,0 +1,297 @@
+"""Six CiA 402 servo drives and the digital inputs on the arm's bus: frames in, torques on the arm, frames out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, Protocol
+
+from services.comm.canbus import Frame
+from services.comm.canopen import Abort, NmtState, SdoAbort
+from services.comm.cia402 import (
+    Command, Fault, Mode, Object, State, StatusBit, after, command_of, fault_text, from_units, to_units,
+)  # fmt: skip
+from sim.canopen_node import CanopenNode
+from sim.digital_io import DigitalInputs
+from sim.servo import DriveRating, JointServo
+
+INPUTS_NODE: Final = 7
+"""Node id of the digital inputs; the drives have 1 to 6, base to flange."""
+
+SYNC_PATIENCE: Final = 3
+"""Periods of 1006h without SYNC after which an enabled drive stops by itself."""
+
+_REGISTERS: Final = {
+    Fault.OVERCURRENT: 0x03, Fault.UNDERVOLTAGE: 0x05, Fault.OVERHEATED: 0x09,
+    Fault.HEARTBEAT: 0x11, Fault.SYNC_LOST: 0x11, Fault.CAN_PASSIVE: 0x11, Fault.BUS_OFF_RECOVERED: 0x11,
+}  # fmt: skip
+_POWERLESS: Final = (Fault.OVERCURRENT, Fault.UNDERVOLTAGE, Fault.ENCODER)
+"""Faults after which a drive cannot brake by its motor: the brake takes over at once."""
+_POWERED: Final = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
+_DOWN: Final = (State.FAULT, State.FAULT_REACTION_ACTIVE)
+
+
+class Plant(Protocol):
+    """The arm as its drives feel it: angles (rad), speeds (rad/s) and torques (N m) by joint, and the joints' brakes."""
+
+    @property
+    def q(self) -> Sequence[float]:
+        """Angles."""
+
+    @property
+    def qd(self) -> Sequence[float]:
+        """Speeds."""
+
+    def brake(self, joint: int) -> None:
+        """Engage a joint's brake and take its torque away."""
+
+    def release(self, joint: int) -> None:
+        """Release a joint's brake."""
+
+    def slow_down(self, factor: float) -> None:
+        """From now on the joints reach this share of their greatest speeds."""
+
+    def step(self, dt: float, tau: Sequence[float]) -> None:
+        """Move on by `dt` seconds under six torques."""
+
+
+def ratings(table: Mapping[str, Any]) -> tuple[DriveRating, ...]:
+    """The drives of an arm whose `[[joint]]` tables give torque (N m), speed (degrees/s) and inertia (kg m^2)."""
+    return tuple(
+        DriveRating(float(joint["torque"]), math.radians(joint["speed"]), float(joint["inertia"])) for joint in table["joint"]
+    )
+
+
+class Drive(CanopenNode):
+    """One drive: CiA 402 state machine in cyclic synchronous position mode around a `JointServo`."""
+
+    def __init__(self, joint: int, rating: DriveRating, plant: Plant) -> None:
+        super().__init__(joint + 1, "puma_drive.eds")
+        self.joint = joint
+        self.plant = plant
+        self.servo = JointServo(rating, plant.q[joint])
+        self.state = State.NOT_READY_TO_SWITCH_ON
+        self.powered = True
+        self.fault = Fault.NONE
+        self._speed_factor = 1.0
+        self._torque = 0.0
+        self._controlword = 0
+        self._synced = 0.0
+        self._error_since: float | None = None
+
+    # Hooks of the CANopen node.
+    def on_nmt(self, now: float, before: NmtState) -> None:
+        """A reset starts the state machine anew; leaving OPERATIONAL while enabled stops the motion (6007h = 2)."""
+        if self.nmt is NmtState.PREOPERATIONAL and before is not NmtState.OPERATIONAL:
+            if self.state not in _DOWN:
+                self._enter(State.SWITCH_ON_DISABLED)
+        elif before is NmtState.OPERATIONAL and self.state is State.OPERATION_ENABLED:
+            self._quick_stop(State.QUICK_STOP_ACTIVE)
+        self._synced = now
+        self._refresh()
+
+    def before_sending(self) -> None:
+        """Bring status, position and what else is asked for up to date."""
+        values, servo = self.values, self.servo
+        values[Object.STATUSWORD, 0] = self.statusword()
+        values[Object.POSITION, 0] = to_units(self.plant.q[self.joint])
+        values[Object.VELOCITY, 0] = to_units(self.plant.qd[self.joint])
+        values[Object.TORQUE, 0] = round(1000.0 * self._torque / servo.rating.torque)
+        values[Object.FOLLOWING_ERROR, 0] = to_units(servo.error)
+        values[Object.ERROR_CODE, 0] = self.fault
+        values[Object.MODE_DISPLAY, 0] = values[Object.MODE, 0]
+
+    def after_receiving(self, now: float) -> None:
+        """Obey the controlword; take over what configuration changes."""
+        word = self.values[Object.CONTROLWORD, 0]
+        before, self._controlword = self._controlword, word
+        command = command_of(word)
+        if command is Command.FAULT_RESET and before & 0x80:
+            return
+        if command is not None:
+            self._obey(now, command)
+
+    def on_sync(self, now: float) -> None:
+        """A new set point is due."""
+        self._synced = now
+        if self.state is State.OPERATION_ENABLED:
+            self.servo.aim(from_units(self._target()))
+
+    def on_master_lost(self, now: float) -> None:
+        """Stop by itself."""
+        self.trip(Fault.HEARTBEAT)
+
+    def check_write(self, index: int, sub: int, value: int) -> None:
+        """No other mode than cyclic synchronous position, and no change of configuration while the motor has torque."""
+        if index == Object.MODE and value not in (Mode.NONE, Mode.CYCLIC_SYNCHRONOUS_POSITION):
+            raise SdoAbort(Abort.VALUE, index, sub)
+        fixed = (Object.MODE, Object.INTERPOLATION_PERIOD, Object.SOFTWARE_LIMITS)
+        if index in fixed and self.state in _POWERED:
+            raise SdoAbort(Abort.STATE, index, sub)
+
+    # What the laboratory does to a drive.
+    def trip(self, fault: Fault) -> None:
+        """A fault occurs: EMCY, then a ramp to rest (the brake at once if there is no power for it), then FAULT."""
+        if self.state in _DOWN:
+            return
+        self.fault = fault
+        self.report(fault, _REGISTERS.get(fault, 0x21))
+        if self.state not in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE) or fault in _POWERLESS:
+            self._enter(State.FAULT)
+        else:
+            self._quick_stop(State.FAULT_REACTION_ACTIVE)
+
+    def slow_down(self, factor: float) -> None:
+        """Give a share of the rated speed from now on; object 607Fh tells."""
+        self._speed_factor = factor
+        self._refresh()
+
+    def statusword(self) -> int:
+        """Object 6041h."""
+        word: int = self.state.value[1] | StatusBit.REMOTE
+        if self.powered:
+            word |= StatusBit.VOLTAGE_ENABLED
+        if self.state is not State.QUICK_STOP_ACTIVE:
+            word |= 0x20 if self.state in _POWERED else 0
+        if self.state is State.OPERATION_ENABLED:
+            word |= StatusBit.FOLLOWS_COMMAND
+            word |= StatusBit.INTERNAL_LIMIT if self.servo.limited else 0
+            word |= StatusBit.FOLLOWING_ERROR if self._error_since is not None else 0
+        return word
+
+    def torque(self, now: float, dt: float) -> float:
+        """Torque of the next `dt` seconds (N m); 0 without power."""
+        if self.state not in _POWERED:
+            return 0.0
+        servo = self.servo
+        self._torque = tau = servo.torque(self.plant.q[self.joint], self.plant.qd[self.joint], dt)
+        if self.state is State.FAULT_REACTION_ACTIVE:
+            if servo.ramped_down and abs(self.plant.qd[self.joint]) < 0.02:
+                self._enter(State.FAULT)
+        elif self.state is State.OPERATION_ENABLED:
+            self._watch(now)
+        return tau
+
+    def _watch(self, now: float) -> None:
+        """Following error (6065h, 6066h) and loss of SYNC (1006h)."""
+        period = self.values[Object.SYNC_PERIOD, 0] * 1e-6
+        if period and now - self._synced > SYNC_PATIENCE * period + 1e-9:
+            self.trip(Fault.SYNC_LOST)
+            return
+        if abs(self.servo.error) <= self.values[Object.FOLLOWING_ERROR_WINDOW, 0] * 1e-6:
+            self._error_since = None
+        elif self._error_since is None:
+            self._error_since = now
+        elif now - self._error_since >= self.values[Object.FOLLOWING_ERROR_TIMEOUT, 0] * 1e-3:
+            self.trip(Fault.FOLLOWING_ERROR)
+
+    def _target(self) -> int:
+        """Object 607Ah within the software limits 607Dh."""
+        low, high = self.values[Object.SOFTWARE_LIMITS, 1], self.values[Object.SOFTWARE_LIMITS, 2]
+        return min(max(self.values[Object.TARGET_POSITION, 0], low), high)
+
+    def _obey(self, now: float, command: Command) -> None:
+        state = after(self.state, command)
+        if state is self.state:
+            return
+        if self.state is State.FAULT:
+            if not self.powered:
+                return  # the cause is still there
+            self.fault = Fault.NONE
+            self.report(Fault.NONE, 0)
+        if state is State.OPERATION_ENABLED:
+            if self.nmt is not NmtState.OPERATIONAL or self.values[Object.MODE, 0] != Mode.CYCLIC_SYNCHRONOUS_POSITION:
+                return
+            self._enable(now)
+        elif state is State.QUICK_STOP_ACTIVE:
+            self._quick_stop(state)
+        else:
+            self._enter(state)
+
+    def _enable(self, now: float) -> None:
+        if self.state is State.QUICK_STOP_ACTIVE:
+            self.servo.follow(from_units(self._target()))
+        else:
+            self.servo.start(self.plant.q[self.joint])
+        self._synced = now
+        self._error_since = None
+        self.plant.release(self.joint)
+        self.state = State.OPERATION_ENABLED
+
+    def _quick_stop(self, state: State) -> None:
+        self.servo.ramp_down(from_units(self.values[Object.QUICK_STOP_DECELERATION, 0]))
+        self.state = state
+
+    def _enter(self, state: State) -> None:
+        """A state without torque: the brake holds."""
+        self._torque = 0.0
+        self.plant.brake(self.joint)
+        self.state = state
+
+    def _refresh(self) -> None:
+        self.servo.limit = self.servo.rating.speed * self._speed_factor
+        self.values[Object.MAX_SPEED, 0] = to_units(self.servo.limit)
+
+
+class DriveBus:
+    """Everything on the arm's bus but the master: six drives (nodes 1 to 6) and the digital inputs (node 7).
+
+    In each step of the plant (1 kHz or faster): `receive` what came, then `step(now, dt)`, which also moves the plant,
+    then send what `drain` gives. Times are seconds on the caller's clock.
+    """
+
+    def __init__(self, plant: Plant, drives: Sequence[DriveRating], now: float = 0.0) -> None:
+        self.plant = plant
+        self.drives = tuple(Drive(joint, rating, plant) for joint, rating in enumerate(drives))
+        self.inputs = DigitalInputs(INPUTS_NODE)
+        self._nodes: tuple[CanopenNode, ...] = (*self.drives, self.inputs)
+        self._own = {node.node: node for node in self._nodes}
+        self.errors = 0
+        for node in self._nodes:
+            node.boot(now)
+
+    def receive(self, now: float, frame: Frame) -> None:
+        """A frame of the master's."""
+        target = self._own.get(frame.id & 0x7F) if 0x180 <= frame.id < 0x700 else None
+        if target is not None and target.rpdo.cob_id in (frame.id, -1):
+            target.receive(now, frame)
+            return
+        for node in self._nodes:
+            node.receive(now, frame)
+
+    def step(self, now: float, dt: float) -> None:
+        """Torques for `dt` seconds, the plant's motion, and what the devices do on time."""
+        for node in self._nodes:
+            node.advance(now)
+        self.plant.step(dt, [drive.torque(now, dt) for drive in self.drives])
+
+    def drain(self) -> list[Frame]:
+        """Frames to the master, oldest first."""
+        frames: list[Frame] = []
+        for node in self._nodes:
+            if node.outbox:
+                frames += node.drain()
+        return frames
+
+    def ball(self, present: bool) -> None:
+        """The light barrier in the cup is interrupted, or free."""
+        self.inputs.put(DigitalInputs.BALL, present)
+
+    def power(self, closed: bool) -> None:
+        """Close or open the arm-power chain (emergency stop). Open: the drives lose power and the brakes fall in."""
+        self.inputs.put(DigitalInputs.POWER, closed)
+        for drive in self.drives:
+            drive.powered = closed
+            if not closed:
+                drive.trip(Fault.UNDERVOLTAGE)
+
+    def trip(self, joint: int, fault: Fault = Fault.OVERCURRENT) -> str:
+        """Make a drive (0 to 5) fail; gives the fault in words."""
+        self.drives[joint].trip(fault)
+        return fault_text(fault)
+
+    def slow_down(self, factor: float) -> None:
+        """A slow arm: drives and plant reach this share (0 to 1] of their speeds."""
+        self.plant.slow_down(factor)
+        for drive in self.drives:
+            drive.slow_down(factor)

@@ -1,0 +1,110 @@
+"""The position loop inside one drive: interpolation between cyclic set points, cascade control, quick-stop ramp."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class DriveRating:
+    """What a drive was sized and commissioned for, at the joint: torque (N m), speed (rad/s), inertia it expects (kg m^2)."""
+
+    torque: float
+    speed: float
+    inertia: float
+
+
+POSITION_GAIN = 45.0
+"""1/s, of the position loop."""
+VELOCITY_GAIN = 180.0
+"""1/s, of the velocity loop; with the inertia it gives a torque."""
+INTEGRAL_GAIN = 40.0
+"""1/s, of the velocity loop's integrator: carries gravity and friction, as drives without a model of the arm must."""
+
+
+class JointServo:
+    """Torque for one joint from set points that come once a period.
+
+    Between set points the reference is a uniform quadratic B-spline of the last three: continuous in velocity, exact at
+    rest, one and a half periods behind. Torque = J (a + Kv (v + Kp e - qd)) + integral, at most the rated torque.
+    """
+
+    def __init__(self, rating: DriveRating, q: float) -> None:
+        self.rating = rating
+        self.limit = rating.speed
+        self.period = 0.004
+        self.limited = False
+        self.start(q)
+
+    def start(self, q: float) -> None:
+        """Begin to hold here, with an empty integrator."""
+        self._points = (q, q, q)
+        self._since = 0.0
+        self.reference, self.velocity, self._acceleration = q, 0.0, 0.0
+        self._integral = 0.0
+        self._ramp: float | None = None
+        self.error = 0.0
+
+    def aim(self, target: float) -> None:
+        """Take the next set point (rad); one that asks for more than the greatest speed is cut and marks `limited`."""
+        if self._ramp is not None:
+            return
+        last = self._points[2]
+        most = self.limit * self.period
+        step = target - last
+        self.limited = abs(step) > most * (1.0 + 1e-3)
+        if self.limited:
+            target = last + math.copysign(most, step)
+        self._points = (self._points[1], last, target)
+        self._since = 0.0
+
+    def ramp_down(self, deceleration: float) -> None:
+        """Bring the reference to rest at so many rad/s^2 and stay there."""
+        self._ramp = deceleration
+
+    @property
+    def ramped_down(self) -> bool:
+        """Whether a ramp has come to its end."""
+        return self._ramp is not None and self.velocity == 0.0
+
+    def follow(self, target: float) -> None:
+        """Leave the ramp and take set points again from where the reference is."""
+        self._ramp = None
+        self._points = (self.reference,) * 3
+        self.aim(target)
+
+    def torque(self, q: float, qd: float, dt: float) -> float:
+        """Torque (N m) for the next `dt` seconds from the measured angle and speed."""
+        if self._ramp is None:
+            self._interpolate(dt)
+        else:
+            self._decelerate(dt)
+        self.error = error = self.reference - q
+        rating = self.rating
+        wanted = self.velocity + POSITION_GAIN * error - qd
+        tau = rating.inertia * (self._acceleration + VELOCITY_GAIN * wanted) + self._integral
+        if -rating.torque < tau < rating.torque:
+            self._integral += rating.inertia * VELOCITY_GAIN * INTEGRAL_GAIN * wanted * dt
+            return tau
+        return math.copysign(rating.torque, tau)
+
+    def _interpolate(self, dt: float) -> None:
+        a, b, c = self._points
+        period = self.period
+        self._since += dt
+        if self._since > period + 1e-9:  # a SYNC is missing: as if the last set point had come again
+            self._points = a, b, c = b, c, c
+            self._since -= period
+        s = self._since / period
+        self.reference = 0.5 * (1.0 - s) * (1.0 - s) * a + (0.5 + s * (1.0 - s)) * b + 0.5 * s * s * c
+        self.velocity = ((1.0 - s) * (b - a) + s * (c - b)) / period
+        self._acceleration = (a - 2.0 * b + c) / (period * period)
+
+    def _decelerate(self, dt: float) -> None:
+        assert self._ramp is not None
+        before = self.velocity
+        change = self._ramp * dt
+        self.velocity = 0.0 if abs(before) <= change else before - math.copysign(change, before)
+        self._acceleration = (self.velocity - before) / dt
+        self.reference += 0.5 * (before + self.velocity) * dt
