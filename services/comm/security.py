@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import ipaddress
 import os
 import secrets
 import stat
@@ -30,6 +31,29 @@ class _Hash(Protocol):
     def update(self, data: bytes, /) -> None: ...
 
     def digest(self) -> bytes: ...
+
+
+class KeyNeededError(Exception):
+    """A socket that other hosts can reach was to be opened without a key."""
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only processes of this host can reach a socket bound to `host`."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def require_key(name: str, host: str, key: bytes | None) -> None:
+    """Refuse to listen where other hosts can connect unless there is a key. Raises KeyNeededError."""
+    if key is None and not is_loopback(host):
+        raise KeyNeededError(
+            f"{name}: refuses to listen on {host}, which other hosts can reach, without a key; make a key file with "
+            "`petrobot keys`, copy it to each host and name it under [keys] in services.toml, or listen on 127.0.0.1"
+        )
 
 
 class KeyFileError(Exception):
