@@ -10,10 +10,28 @@ from typing import Final
 
 from services.comm.canbus import Frame
 from services.comm.canopen import (
-    HEARTBEAT_BASE, NMT_ID, PDO_OFF, SDO_REPLY_BASE, SDO_REQUEST_BASE, SYNC_ID, TPDO1_BASE,
-    Abort, Mapped, NmtCommand, NmtState, SdoAbort, SdoMessage, Type, emergency, heartbeat, parse_sdo, pdo_struct,
-    sdo_abort, sdo_read_reply, sdo_write_reply,
-)  # fmt: skip
+    HEARTBEAT_BASE,
+    NMT_ID,
+    PDO_OFF,
+    SDO_REPLY_BASE,
+    SDO_REQUEST_BASE,
+    SYNC_ID,
+    TPDO1_BASE,
+    Abort,
+    Mapped,
+    NmtCommand,
+    NmtState,
+    SdoAbortError,
+    SdoMessage,
+    Type,
+    emergency,
+    heartbeat,
+    parse_sdo,
+    pdo_struct,
+    sdo_abort,
+    sdo_read_reply,
+    sdo_write_reply,
+)
 
 Key = tuple[int, int]
 """Index and sub-index of an object."""
@@ -74,30 +92,30 @@ class Dictionary:
         self.values.update(self._defaults)
 
     def entry(self, index: int, sub: int) -> Entry:
-        """The object; raises SdoAbort if there is none."""
+        """The object; raises SdoAbortError if there is none."""
         found = self.entries.get((index, sub))
         if found is None:
             known = index in self._records or (index, 0) in self.entries
-            raise SdoAbort(Abort.NO_SUBINDEX if known else Abort.NO_OBJECT, index, sub)
+            raise SdoAbortError(Abort.NO_SUBINDEX if known else Abort.NO_OBJECT, index, sub)
         return found
 
     def read(self, index: int, sub: int) -> bytes:
         """Bytes of an object's value."""
         entry = self.entry(index, sub)
         if entry.access.startswith("wo"):
-            raise SdoAbort(Abort.WRITE_ONLY, index, sub)
+            raise SdoAbortError(Abort.WRITE_ONLY, index, sub)
         return entry.type.pack(self.values[index, sub])
 
     def checked(self, index: int, sub: int, data: bytes) -> int:
-        """The value that a write of these bytes gives; raises SdoAbort if it may not be written."""
+        """The value that a write of these bytes gives; raises SdoAbortError if it may not be written."""
         entry = self.entry(index, sub)
         if not entry.writable:
-            raise SdoAbort(Abort.READ_ONLY, index, sub)
+            raise SdoAbortError(Abort.READ_ONLY, index, sub)
         if len(data) != entry.type.size:
-            raise SdoAbort(Abort.TOO_LONG if len(data) > entry.type.size else Abort.TOO_SHORT, index, sub)
+            raise SdoAbortError(Abort.TOO_LONG if len(data) > entry.type.size else Abort.TOO_SHORT, index, sub)
         value = entry.type.unpack(data)
         if not entry.low <= value <= entry.high:
-            raise SdoAbort(Abort.TOO_HIGH if value > entry.high else Abort.TOO_LOW, index, sub)
+            raise SdoAbortError(Abort.TOO_HIGH if value > entry.high else Abort.TOO_LOW, index, sub)
         return value
 
 
@@ -115,7 +133,7 @@ class Pdo:
     def refresh(self) -> None:
         """Take over what the dictionary says."""
         if not self.exists:
-            self.on, self.cob_id = False, -1
+            self.on, self.cob_id, self.synchronous = False, -1, False
             return
         cob_id = self._values[self.parameters, 1]
         self.on, self.cob_id = not cob_id & PDO_OFF, cob_id & 0x7FF
@@ -125,27 +143,27 @@ class Pdo:
         self.keys = tuple((mapped.index, mapped.sub) for mapped in objects)
 
     def mapped(self, entry: int) -> Mapped:
-        """A mapping entry taken apart; raises SdoAbort if it cannot be mapped."""
+        """A mapping entry taken apart; raises SdoAbortError if it cannot be mapped."""
         index, sub, bits = entry >> 16, entry >> 8 & 0xFF, entry & 0xFF
         found = self._dictionary.entry(index, sub)
         if not found.mappable or found.type.size * 8 != bits:
-            raise SdoAbort(Abort.NOT_MAPPABLE, self.mapping)
+            raise SdoAbortError(Abort.NOT_MAPPABLE, self.mapping)
         if self.parameters == RPDO and not found.writable:
-            raise SdoAbort(Abort.NOT_MAPPABLE, self.mapping)
+            raise SdoAbortError(Abort.NOT_MAPPABLE, self.mapping)
         return Mapped(index, sub, found.type)
 
     def check(self, index: int, sub: int, value: int) -> None:
-        """Raise SdoAbort if one of the PDO's records must not get this value now (CiA 301, 7.5.2.35 and 36)."""
+        """Raise SdoAbortError if one of the PDO's records must not get this value now (CiA 301, 7.5.2.35 and 36)."""
         if index == self.mapping and (self.on or (sub and self._values[index, 0])):
-            raise SdoAbort(Abort.STATE, index, sub)
+            raise SdoAbortError(Abort.STATE, index, sub)
         if index == self.mapping and sub == 0 and value:
             objects = [self.mapped(self._values[index, number]) for number in range(1, value + 1)]
             if sum(mapped.type.size for mapped in objects) > 8:
-                raise SdoAbort(Abort.PDO_LENGTH, index, sub)
+                raise SdoAbortError(Abort.PDO_LENGTH, index, sub)
         if index == self.mapping and sub and value:
             self.mapped(value)
         if index == self.parameters and sub == 1 and self.on and not value & PDO_OFF and value & 0x7FF != self.cob_id:
-            raise SdoAbort(Abort.VALUE, index, sub)
+            raise SdoAbortError(Abort.VALUE, index, sub)
 
 
 class CanopenNode:
@@ -183,7 +201,7 @@ class CanopenNode:
         """The NMT state has changed."""
 
     def check_write(self, index: int, sub: int, value: int) -> None:
-        """Raise SdoAbort if the device's state forbids this write."""
+        """Raise SdoAbortError if the device's state forbids this write."""
 
     # The machine.
     def boot(self, now: float) -> None:
@@ -286,17 +304,17 @@ class CanopenNode:
             request = parse_sdo(frame)
             if request.command != 0x80:
                 self.outbox.append(self._answer(now, request))
-        except SdoAbort as reason:
+        except SdoAbortError as reason:
             self.outbox.append(sdo_abort(SDO_REPLY_BASE + self.node, index, sub, reason.code))
 
     def _answer(self, now: float, request: SdoMessage) -> Frame:
-        _, index, sub, data = request
+        index, sub, data = request.index, request.sub, request.data
         if request.command == 0x40:
             self.dictionary.entry(index, sub)
             self.before_sending()
             return sdo_read_reply(self.node, index, sub, self.dictionary.read(index, sub))
         if request.command != 0x20:
-            raise SdoAbort(Abort.COMMAND, index, sub)
+            raise SdoAbortError(Abort.COMMAND, index, sub)
         self._write(now, index, sub, data)
         return sdo_write_reply(self.node, index, sub)
 
@@ -306,7 +324,7 @@ class CanopenNode:
         if pdo is not None:
             pdo.check(index, sub, value)
         if (index, sub) in ((RPDO, 1), (TPDO, 1)) and not self._may_use(value & 0x7FF):
-            raise SdoAbort(Abort.VALUE, index, sub)
+            raise SdoAbortError(Abort.VALUE, index, sub)
         self.check_write(index, sub, value)
         self.values[index, sub] = value
         if pdo is not None and (sub == 0 or index == pdo.parameters):
@@ -319,5 +337,3 @@ class CanopenNode:
     def _may_use(cob_id: int) -> bool:
         """Whether a PDO may have this identifier: none of NMT, SYNC, EMCY, SDO and heartbeat (CiA 301, table 54)."""
         return TPDO1_BASE < cob_id < SDO_REPLY_BASE and cob_id not in _PREDEFINED
-
-

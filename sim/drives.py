@@ -7,10 +7,20 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final, Protocol
 
 from services.comm.canbus import Frame
-from services.comm.canopen import Abort, NmtState, SdoAbort
+from services.comm.canopen import Abort, NmtState, SdoAbortError
 from services.comm.cia402 import (
-    Command, Fault, Mode, Object, State, StatusBit, after, command_of, fault_text, from_units, to_units,
-)  # fmt: skip
+    Command,
+    Fault,
+    Mode,
+    Object,
+    State,
+    StatusBit,
+    after,
+    command_of,
+    fault_text,
+    from_units,
+    to_units,
+)
 from sim.canopen_node import CanopenNode
 from sim.digital_io import DigitalInputs
 from sim.servo import DriveRating, JointServo
@@ -58,7 +68,8 @@ class Plant(Protocol):
 def ratings(table: Mapping[str, Any]) -> tuple[DriveRating, ...]:
     """The drives of an arm whose `[[joint]]` tables give torque (N m), speed (degrees/s) and inertia (kg m^2)."""
     return tuple(
-        DriveRating(float(joint["torque"]), math.radians(joint["speed"]), float(joint["inertia"])) for joint in table["joint"]
+        DriveRating(float(joint["torque"]), math.radians(joint["speed"]), float(joint["inertia"]))
+        for joint in table["joint"]
     )
 
 
@@ -124,10 +135,10 @@ class Drive(CanopenNode):
     def check_write(self, index: int, sub: int, value: int) -> None:
         """No other mode than cyclic synchronous position, and no change of configuration while the motor has torque."""
         if index == Object.MODE and value not in (Mode.NONE, Mode.CYCLIC_SYNCHRONOUS_POSITION):
-            raise SdoAbort(Abort.VALUE, index, sub)
+            raise SdoAbortError(Abort.VALUE, index, sub)
         fixed = (Object.MODE, Object.INTERPOLATION_PERIOD, Object.SOFTWARE_LIMITS)
         if index in fixed and self.state in _POWERED:
-            raise SdoAbort(Abort.STATE, index, sub)
+            raise SdoAbortError(Abort.STATE, index, sub)
 
     # What the laboratory does to a drive.
     def trip(self, fault: Fault) -> None:
@@ -151,8 +162,6 @@ class Drive(CanopenNode):
         word: int = self.state.value[1] | StatusBit.REMOTE
         if self.powered:
             word |= StatusBit.VOLTAGE_ENABLED
-        if self.state is not State.QUICK_STOP_ACTIVE:
-            word |= 0x20 if self.state in _POWERED else 0
         if self.state is State.OPERATION_ENABLED:
             word |= StatusBit.FOLLOWS_COMMAND
             word |= StatusBit.INTERNAL_LIMIT if self.servo.limited else 0

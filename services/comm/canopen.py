@@ -114,7 +114,7 @@ class Abort(IntEnum):
     STATE = 0x08000022
 
 
-class SdoAbort(Exception):
+class SdoAbortError(Exception):
     """An SDO transfer was refused; `code` is a CiA 301 abort code."""
 
     def __init__(self, code: int, index: int = 0, sub: int = 0) -> None:
@@ -192,7 +192,8 @@ def sdo_abort(cob_id: int, index: int, sub: int, code: int) -> Frame:
     return Frame(cob_id, struct.pack("<BHBI", 0x80, index, sub, code))
 
 
-class SdoMessage(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class SdoMessage:
     """An SDO frame taken apart; `data` holds the bytes of an expedited transfer or the abort code."""
 
     command: int
@@ -202,7 +203,7 @@ class SdoMessage(NamedTuple):
 
 
 def parse_sdo(frame: Frame) -> SdoMessage:
-    """Take an SDO frame apart; raises ValueError if it has not 8 bytes, SdoAbort(COMMAND) if it is no expedited transfer."""
+    """Take an SDO frame apart; raises ValueError if it has not 8 bytes, SdoAbortError(COMMAND) if it is no expedited transfer."""
     if len(frame.data) != 8:
         raise ValueError(f"SDO frame {frame.id:#05x} with {len(frame.data)} bytes: must be 8")
     command, index, sub = struct.unpack_from("<BHB", frame.data)
@@ -212,10 +213,11 @@ def parse_sdo(frame: Frame) -> SdoMessage:
     if kind in (0x20, 0x40) and command & 0x02:
         size = 4 - (command >> 2 & 0x03) if command & 0x01 else 4
         return SdoMessage(kind, index, sub, frame.data[4 : 4 + size])
-    raise SdoAbort(Abort.COMMAND, index, sub)
+    raise SdoAbortError(Abort.COMMAND, index, sub)
 
 
-class Mapped(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Mapped:
     """One object in a PDO."""
 
     index: int
@@ -298,7 +300,9 @@ class SdoClient:
         transfer = self._queue[0]
         if self._asked:
             if now >= self._due:
-                self._fail(f"node {self.node}: no answer from {transfer.index:#06x}:{transfer.sub} within {self.timeout} s")
+                self._fail(
+                    f"node {self.node}: no answer from {transfer.index:#06x}:{transfer.sub} within {self.timeout} s"
+                )
                 return [sdo_abort(SDO_REQUEST_BASE + self.node, transfer.index, transfer.sub, Abort.TIMEOUT)]
             return []
         self._asked, self._due = True, now + self.timeout
@@ -316,14 +320,14 @@ class SdoClient:
             if (reply.index, reply.sub) != (transfer.index, transfer.sub):
                 return
             self._settle(transfer, reply)
-        except (ValueError, SdoAbort) as reason:
+        except (ValueError, SdoAbortError) as reason:
             self._fail(f"node {self.node}: {reason}")
 
     def _settle(self, transfer: Transfer, reply: SdoMessage) -> None:
         if reply.command == 0x80:
-            raise SdoAbort(int.from_bytes(reply.data, "little"), reply.index, reply.sub)
+            raise SdoAbortError(int.from_bytes(reply.data, "little"), reply.index, reply.sub)
         if reply.command != (0x40 if transfer.value is None else 0x60):
-            raise SdoAbort(Abort.COMMAND, reply.index, reply.sub)
+            raise SdoAbortError(Abort.COMMAND, reply.index, reply.sub)
         if transfer.value is None:
             self.results[transfer.index, transfer.sub] = transfer.type.unpack(reply.data)
         self._queue.popleft()

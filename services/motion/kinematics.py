@@ -58,9 +58,17 @@ class Puma:
         twists = np.round(np.degrees(model.alpha), 9).tolist()
         zero = [*model.d[[1, 4, 5]], *model.a[[0, 3, 4, 5]]]
         if twists != [90.0, 0.0, -90.0, 90.0, -90.0, 0.0] or any(zero):
-            raise ValueError("closed-form kinematics needs a PUMA's twists (90, 0, -90, 90, -90, 0 degrees) and zero d2 d5 d6 a1 a4 a5 a6")
+            raise ValueError(
+                "closed-form kinematics needs a PUMA's twists (90, 0, -90, 90, -90, 0 degrees) and zero d2 d5 d6 a1 a4 a5 a6"
+            )
         return cls(
-            float(model.d[0]), float(model.a[1]), float(model.a[2]), float(model.d[2]), float(model.d[3]), model.lower, model.upper
+            float(model.d[0]),
+            float(model.a[1]),
+            float(model.a[2]),
+            float(model.d[2]),
+            float(model.d[3]),
+            model.lower,
+            model.upper,
         )
 
     @property
@@ -72,7 +80,16 @@ class Puma:
         """Pose of frame 6 for joint poses (..., 6): matrices (..., 4, 4), m."""
         q = np.asarray(q, dtype=float)
         c, s = np.cos(q), np.sin(q)
-        c1, s1, c4, s4, c5, s5, c6, s6 = c[..., 0], s[..., 0], c[..., 3], s[..., 3], c[..., 4], s[..., 4], c[..., 5], s[..., 5]
+        c1, s1, c4, s4, c5, s5, c6, s6 = (
+            c[..., 0],
+            s[..., 0],
+            c[..., 3],
+            s[..., 3],
+            c[..., 4],
+            s[..., 4],
+            c[..., 5],
+            s[..., 5],
+        )
         c23, s23 = np.cos(q[..., 1] + q[..., 2]), np.sin(q[..., 1] + q[..., 2])
         # Frame 6 seen from frame 3, column by column (x, y, z).
         wrist = (

@@ -111,7 +111,9 @@ def read_arm(text: str) -> ArmModel:
     joints, links = table.get("joint", []), table.get("link", [])
     if len(joints) != JOINTS or len(links) != JOINTS:
         raise ModelError(f"puma560.toml: needs {JOINTS} [[joint]] and [[link]], has {len(joints)} and {len(links)}")
-    limits = np.radians([_numbers(joint, "limits", f"puma560.toml: joint {i + 1}", 2) for i, joint in enumerate(joints)])
+    limits = np.radians(
+        [_numbers(joint, "limits", f"puma560.toml: joint {i + 1}", 2) for i, joint in enumerate(joints)]
+    )
     body = table.get("body", {})
     degree = math.pi / 180.0
     return ArmModel(

@@ -90,7 +90,9 @@ class Trajectory:
     `target` None means: come to rest. Limits may be changed at any time; a joint beyond new limits brakes into them.
     """
 
-    def __init__(self, q: Sequence[float], period: float, speed: Sequence[float], acceleration: Sequence[float]) -> None:
+    def __init__(
+        self, q: Sequence[float], period: float, speed: Sequence[float], acceleration: Sequence[float]
+    ) -> None:
         self.period = period
         self.q = [float(value) for value in q]
         self.qd = [0.0] * len(self.q)
@@ -134,9 +136,7 @@ class Trajectory:
     def resting(self, q: Sequence[float], qd: Sequence[float]) -> list[float]:
         """Where all joints come to rest if they brake from here."""
         period = self.period
-        return [
-            angle + braking_distance(v, period, a) for angle, v, a in zip(q, qd, self.acceleration, strict=True)
-        ]
+        return [angle + braking_distance(v, period, a) for angle, v, a in zip(q, qd, self.acceleration, strict=True)]
 
     def accept(self, q: list[float], qd: list[float]) -> None:
         """Make a proposed or braking state the present one."""
