@@ -209,7 +209,7 @@ class PinholeCamera:
         frame = np.asarray(pose, float)
 
         def point_at(pixels: Array) -> Array:
-            return (self._on_plane(pixels, frame[:3, 3], frame[:3, 2]) - frame[:3, 3]) @ frame[:3, :3]
+            return np.asarray((self._on_plane(pixels, frame[:3, 3], frame[:3, 2]) - frame[:3, 3]) @ frame[:3, :3])
 
         outline = self.project(board.outline() @ frame[:3, :3].T + frame[:3, 3])
         (left, top), (right, bottom) = outline.min(axis=0), outline.max(axis=0)

@@ -1,0 +1,216 @@
+"""Calibration from images of a chessboard: lens, distortion and the camera's place in the base frame, solved together.
+
+Views whose board pose in the base frame is known (laid on the table at measured places) fix the camera to the base; views
+held by hand at any tilt fix the lens. Start: OpenCV's calibrateCamera (Zhang 2000). Then one least-squares problem over all
+unknowns: intrinsics, camera pose, and each view's pose, known ones held to their measured value by a prior of its accuracy
+(bundle adjustment; no hand-eye routine is needed, which OpenCV 5 dropped). Pure: images in, calibration out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from services.vision.optics import Optics
+
+Array = NDArray[np.float64]
+
+CORNER_SIGMA_PX = 0.07
+"""px, accuracy of a chessboard corner (residual of calibrations at 3 grey levels of noise)."""
+PLACEMENT_SIGMA = 0.0003
+"""m, accuracy to which the place of a board on the table is known."""
+PLACEMENT_TURN = 0.0005
+"""rad, accuracy of its direction."""
+FEWEST_VIEWS, FEWEST_KNOWN = 6, 3
+LENS = 8
+"""fx fy cx cy k1 k2 p1 p2."""
+
+
+class CalibrationError(ValueError):
+    """The images do not make a calibration; the text says why and what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Board:
+    """A chessboard of `columns` x `rows` inner corners, squares of `square` m; its frame has its origin at the first corner,
+    beside the black square that touches the board's printed corner, x along the columns, z out of the board."""
+
+    columns: int = 9
+    rows: int = 6
+    square: float = 0.060
+
+    def points(self) -> Array:
+        """Inner corners (rows * columns, 3) in the board's frame (m)."""
+        y, x = np.mgrid[0 : self.rows, 0 : self.columns].astype(float)
+        return np.stack([x.ravel(), y.ravel(), np.zeros(self.rows * self.columns)], axis=-1) * self.square
+
+
+@dataclass(frozen=True, slots=True)
+class BoardView:
+    """One image of the board, grey levels (height, width); `pose` (4, 4): board frame to base frame where it is known."""
+
+    pixels: NDArray[np.uint8]
+    pose: Array | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """A calibrated camera and how well it is known."""
+
+    optics: Optics
+    views: int
+    residual_px: float
+    """rms distance of corners from where the calibrated camera expects them."""
+    table_residual: float
+    """m, rms distance on the board's plane between corners of the known views and their stated places."""
+    table_sigma: float
+    """m, the largest standard deviation, from the fit's covariance, of a point of the seen plane."""
+
+
+def find_corners(pixels: NDArray[np.uint8], board: Board) -> Array | None:
+    """Inner corners (n, 2) px in the order of `Board.points`; None when the board is not seen whole."""
+    found, corners = cv2.findChessboardCornersSB(
+        pixels, (board.columns, board.rows), None, cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+    )
+    if not found or corners is None:
+        return None
+    grid = np.asarray(corners, float).reshape(board.rows, board.columns, 2)
+    if np.linalg.det(np.stack([grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]])) > 0.0:
+        grid = grid[::-1]  # seen from the printed side, x to y turns left; image y points down
+    ordered = grid.reshape(-1, 2)
+    return ordered if _begins_black(pixels, ordered, board) else ordered[::-1]
+
+
+def _begins_black(pixels: NDArray[np.uint8], corners: Array, board: Board) -> bool:
+    """Whether the inner square at the first corner is black: tells the board from itself turned by 180 degrees."""
+    grid = corners.reshape(board.rows, board.columns, 2)
+
+    def square(row: int, column: int) -> float:
+        u, v = np.rint(grid[row : row + 2, column : column + 2].mean(axis=(0, 1))).astype(int)
+        return float(pixels[v - 1 : v + 2, u - 1 : u + 2].mean())
+
+    return square(0, 0) < (square(0, 1) + square(1, 0)) / 2
+
+
+def calibrate(views: Sequence[BoardView], board: Board) -> Calibration:
+    """Calibrate from board images. Raises CalibrationError when they do not suffice."""
+    seen = [(corners, view) for view in views if (corners := find_corners(view.pixels, board)) is not None]
+    known = sum(view.pose is not None for _, view in seen)
+    if len(seen) < FEWEST_VIEWS or known < FEWEST_KNOWN:
+        raise CalibrationError(
+            f"the whole board is seen in {len(seen)} of {len(views)} images, {known} of them with a known pose; "
+            f"take at least {FEWEST_VIEWS}, {FEWEST_KNOWN} of them at known places of the table"
+        )
+    shape = seen[0][1].pixels.shape
+    return _Adjustment(board, [c for c, _ in seen], [v.pose for _, v in seen], (shape[1], shape[0])).solve()
+
+
+class _Adjustment:
+    """The least-squares problem. Unknowns: lens (8), camera pose (6: turn and shift), one pose (6) a view: of a known view its
+    deviation from the stated pose in the board's frame, of any other the board in the camera's frame."""
+
+    def __init__(
+        self, board: Board, corners: Sequence[Array], poses: Sequence[Array | None], size: tuple[int, int]
+    ) -> None:
+        self._points = board.points()
+        self._corners = corners
+        self._poses = poses
+        self._size = size
+
+    def solve(self) -> Calibration:
+        """Start from calibrateCamera, refine all together, report residuals."""
+        start = self._start()
+        fit = least_squares(self._residuals, start, x_scale="jac", method="trf", ftol=1e-12, xtol=1e-12)
+        if not fit.success:
+            raise CalibrationError(f"the calibration does not converge ({fit.message}); take more and sharper images")
+        optics = self._optics(fit.x)
+        count = 2 * len(self._points) * len(self._corners)
+        residual = float(np.sqrt(2.0 * np.mean(fit.fun[:count] ** 2))) * CORNER_SIGMA_PX
+        return Calibration(
+            optics, len(self._corners), residual, self._table_residual(optics), self._table_sigma(fit.x, fit.jac)
+        )
+
+    def _start(self) -> Array:
+        points = [self._points.astype(np.float32)] * len(self._corners)
+        corners = [c.astype(np.float32)[:, None, :] for c in self._corners]
+        _, matrix, distortion, turns, shifts = cv2.calibrateCamera(
+            points,
+            corners,
+            self._size,
+            np.eye(3),
+            np.zeros(5),
+            flags=cv2.CALIB_FIX_K3,
+        )
+        placed = [_pose(np.ravel(turn), np.ravel(shift)) for turn, shift in zip(turns, shifts, strict=True)]
+        first = next(i for i, pose in enumerate(self._poses) if pose is not None)
+        base = placed[first] @ np.linalg.inv(np.asarray(self._poses[first]))
+        parts = [[matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]], np.ravel(distortion)[:4], _vector(base)]
+        parts += [
+            np.zeros(6) if known is not None else _vector(p) for known, p in zip(self._poses, placed, strict=True)
+        ]
+        return np.concatenate([np.asarray(part, float) for part in parts])
+
+    def _residuals(self, unknown: Array) -> Array:
+        """Corner residuals in units of their accuracy, then the deviations of the known views in units of theirs."""
+        fx, fy, cx, cy = unknown[:4]
+        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        base = _pose(unknown[LENS : LENS + 3], unknown[LENS + 3 : LENS + 6])
+        accuracy = np.array([PLACEMENT_TURN] * 3 + [PLACEMENT_SIGMA] * 3)
+        parts, priors = [], []
+        for k, (corners, known) in enumerate(zip(self._corners, self._poses, strict=True)):
+            own = unknown[LENS + 6 + 6 * k : LENS + 12 + 6 * k]
+            pose = _pose(own[:3], own[3:])
+            if known is not None:
+                pose = base @ known @ pose
+                priors.append(own / accuracy)
+            turn = cv2.Rodrigues(pose[:3, :3])[0]
+            expected = cv2.projectPoints(self._points, turn, pose[:3, 3], matrix, unknown[4:LENS])[0]
+            parts.append((expected.reshape(-1, 2) - corners).ravel() / CORNER_SIGMA_PX)
+        return np.concatenate(parts + priors)
+
+    def _optics(self, unknown: Array) -> Optics:
+        fx, fy, cx, cy, k1, k2, p1, p2 = (float(value) for value in unknown[:LENS])
+        base = _pose(unknown[LENS : LENS + 3], unknown[LENS + 3 : LENS + 6])
+        return Optics((fx, fy), (cx, cy), (k1, k2, p1, p2), base[:3, :3], -base[:3, :3].T @ base[:3, 3])
+
+    def _table_residual(self, optics: Optics) -> float:
+        squares = []
+        for corners, pose in zip(self._corners, self._poses, strict=True):
+            if pose is not None:
+                stated = self._points @ pose[:3, :3].T + pose[:3, 3]
+                squares.append(np.sum((optics.to_plane(corners, float(pose[2, 3])) - stated[:, :2]) ** 2, axis=-1))
+        return float(np.sqrt(np.mean(squares)))
+
+    def _table_sigma(self, unknown: Array, jacobian: Array) -> float:
+        """Propagate the fit's covariance to the plane of the known views, at a grid of pixels."""
+        covariance = np.linalg.pinv(jacobian.T @ jacobian)[: LENS + 6, : LENS + 6]
+        u, v = np.meshgrid(np.linspace(0, self._size[0] - 1, 9), np.linspace(0, self._size[1] - 1, 7))
+        grid = np.stack([u.ravel(), v.ravel()], axis=-1)
+        z = float(np.mean([pose[2, 3] for pose in self._poses if pose is not None]))
+        middle = self._optics(unknown).to_plane(grid, z).ravel()
+        slopes = np.empty((len(middle), LENS + 6))
+        for k in range(LENS + 6):
+            step = np.sqrt(covariance[k, k])
+            moved = unknown.copy()
+            moved[k] += step
+            slopes[:, k] = (self._optics(moved).to_plane(grid, z).ravel() - middle) / step
+        variances = np.einsum("ij,jk,ik->i", slopes, covariance, slopes).reshape(-1, 2)
+        return float(np.sqrt(variances.sum(axis=-1).max()))
+
+
+def _pose(turn: Array, shift: Array) -> Array:
+    """(4, 4) from a rotation vector (3,) and a translation (3,)."""
+    pose = np.eye(4)
+    pose[:3, :3] = cv2.Rodrigues(np.asarray(turn, float))[0]
+    pose[:3, 3] = shift
+    return pose
+
+
+def _vector(pose: Array) -> Array:
+    """Rotation vector and translation (6,) of a pose (4, 4)."""
+    return np.concatenate([np.ravel(cv2.Rodrigues(pose[:3, :3])[0]), pose[:3, 3]])

@@ -1,0 +1,129 @@
+"""The calibration on disk: calibration.toml in and out, and folders of board images with their poses."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from services.vision.calibration import Board, BoardView, Calibration
+from services.vision.optics import Optics
+
+SCHEMA = 1
+DEFAULT = Path(__file__).with_name("calibration.toml")
+"""Calibration of the simulated camera, made from its images by `petrobot calibrate`."""
+
+
+class CalibrationFileError(ValueError):
+    """A calibration file or a folder of views that cannot be used; the text names file, key and remedy."""
+
+
+def calibration_text(calibration: Calibration) -> str:
+    """The calibration as TOML."""
+    optics = calibration.optics
+    rows = ",\n  ".join(_numbers(row) for row in optics.rotation)
+    return f"""\
+# A camera's calibration. Made by `petrobot calibrate`; remake it when camera, lens or table moved.
+schema = {SCHEMA}
+views = {calibration.views}
+residual_px = {calibration.residual_px:.4f}  # rms of the board's corners
+table_residual = {calibration.table_residual:.6f}  # m, rms of corners at known places
+table_sigma = {calibration.table_sigma:.6f}  # m, largest standard deviation of a point of the table
+
+[lens]
+focal_px = {_numbers(optics.focal)}
+centre_px = {_numbers(optics.centre)}
+distortion = {_numbers(optics.distortion)}  # k1 k2 p1 p2, OpenCV's order
+
+[pose]
+position = {_numbers(optics.position)}  # m, optical centre in the base frame
+# camera coordinates of a base-frame point p are rotation (p - position); rows are the camera's x, y and z axes
+rotation = [
+  {rows},
+]
+"""
+
+
+def _numbers(values: Any) -> str:
+    return "[" + ", ".join(repr(round(float(value), 10)) for value in values) + "]"
+
+
+def parse_calibration(text: str, name: str) -> Calibration:
+    """Read a calibration's TOML; `name` is the file, for the fault's text. Raises CalibrationFileError."""
+    try:
+        data = tomllib.loads(text)
+        if data.get("schema") != SCHEMA:
+            raise CalibrationFileError(f"{name}: schema must be {SCHEMA}; remake it with petrobot calibrate")
+        lens, pose = data["lens"], data["pose"]
+        optics = Optics(
+            _tuple(lens["focal_px"], 2),
+            _tuple(lens["centre_px"], 2),
+            _tuple(lens["distortion"], 4),
+            np.array(pose["rotation"], float).reshape(3, 3),
+            np.array(pose["position"], float).reshape(3),
+        )
+        quality = (float(data[key]) for key in ("residual_px", "table_residual", "table_sigma"))
+        calibration = Calibration(optics, int(data["views"]), *quality)
+    except tomllib.TOMLDecodeError as fault:
+        raise CalibrationFileError(f"{name}: no TOML ({fault}); remake it with petrobot calibrate") from fault
+    except KeyError as fault:
+        raise CalibrationFileError(f"{name}: key {fault} is missing; remake it with petrobot calibrate") from fault
+    except (TypeError, ValueError) as fault:
+        raise CalibrationFileError(f"{name}: {fault}; remake it with petrobot calibrate") from fault
+    if not np.allclose(optics.rotation @ optics.rotation.T, np.eye(3), atol=1e-6):
+        raise CalibrationFileError(f"{name}: [pose] rotation is no rotation; remake it with petrobot calibrate")
+    return calibration
+
+
+def _tuple(values: Sequence[float], count: int) -> Any:
+    if len(values) != count:
+        raise ValueError(f"{count} numbers expected, {list(values)} found")
+    return tuple(float(value) for value in values)
+
+
+def read_views(folder: Path) -> tuple[list[BoardView], Board]:
+    """Board images of a folder, as its views.toml lists them.
+
+    views.toml: `[board] columns, rows, square` and for each image `[[views]] file`, with `pose` (4 rows of 4 numbers, board frame
+    to base frame, m) where the board lay at a known place. Raises CalibrationFileError.
+    """
+    path = folder / "views.toml"
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        board = Board(int(data["board"]["columns"]), int(data["board"]["rows"]), float(data["board"]["square"]))
+        return [_read_view(folder, entry) for entry in data["views"]], board
+    except OSError as fault:
+        raise CalibrationFileError(f"{path}: cannot be read ({fault.strerror}); it lists the board images") from fault
+    except tomllib.TOMLDecodeError as fault:
+        raise CalibrationFileError(f"{path}: no TOML ({fault}); mend that line") from fault
+    except KeyError as fault:
+        raise CalibrationFileError(f"{path}: key {fault} is missing; docs/vision.md shows such a file") from fault
+
+
+def _read_view(folder: Path, entry: Mapping[str, Any]) -> BoardView:
+    path = folder / str(entry["file"])
+    pixels = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if pixels is None:
+        raise CalibrationFileError(f"{path}: no image; mend `file` in views.toml or take the image again")
+    pose = None if "pose" not in entry else np.array(entry["pose"], float)
+    if pose is not None and pose.shape != (4, 4):
+        raise CalibrationFileError(f"{folder / 'views.toml'}: pose of {path.name} needs 4 rows of 4 numbers")
+    return BoardView(np.asarray(pixels, np.uint8), pose)
+
+
+def write_views(folder: Path, views: Sequence[BoardView], board: Board) -> None:
+    """Write board images and their views.toml as `read_views` takes them."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lines = [f"[board]\ncolumns = {board.columns}\nrows = {board.rows}\nsquare = {board.square}  # m\n"]
+    for number, view in enumerate(views, 1):
+        name = f"view{number:02}.png"
+        cv2.imwrite(str(folder / name), view.pixels)
+        lines.append(f'[[views]]\nfile = "{name}"')
+        if view.pose is not None:
+            lines.append("pose = [\n" + "".join(f"  {_numbers(row)},\n" for row in view.pose) + "]")
+        lines.append("")
+    (folder / "views.toml").write_text("\n".join(lines), encoding="utf-8")

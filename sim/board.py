@@ -1,0 +1,75 @@
+"""Board images as somebody would take them in the simulated laboratory: laid on the table at measured places, and held by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.camera import Array, PinholeCamera
+from sim.scenery import Chessboard
+
+PLACEMENT = 0.0003
+"""m, standard deviation of where the board really lies around where it was measured to lie."""
+DIRECTION = 0.0005
+"""rad, the same of its direction."""
+LAID = (
+    (0.30, -0.22, 0.0),
+    (0.30, 0.22, 0.1),
+    (0.35, 0.00, 1.6),
+    (0.80, -0.20, 3.1),
+    (0.80, 0.00, 0.0),
+    (0.80, 0.20, -0.1),
+    (1.25, 0.00, 1.5),
+    (1.30, 0.20, 3.2),
+    (1.30, -0.22, 0.1),
+)
+"""Middle of the board on the table (m from the near edge, y) and its direction (rad)."""
+HELD = (
+    (0.35, -0.15, 0.35, 0.45, 0.0, 0.2),
+    (0.35, 0.20, 0.30, -0.45, 0.2, -0.4),
+    (0.80, 0.00, 0.45, 0.0, 0.5, 0.0),
+    (0.80, 0.10, 0.30, 0.4, -0.4, 0.8),
+    (0.85, -0.15, 0.55, -0.3, -0.3, 1.5),
+    (1.30, 0.15, 0.35, 0.5, 0.1, -0.2),
+    (1.25, -0.20, 0.30, -0.4, 0.4, 0.3),
+    (0.80, 0.00, 0.70, 0.1, 0.2, 0.1),
+)
+"""Middle of the board (m from the near edge, y, m above the table) and its turns about x, y and z (rad)."""
+
+
+def board_views(
+    cell: Mapping[str, Any], camera: PinholeCamera, rng: np.random.Generator, board: Chessboard | None = None
+) -> Iterator[tuple[NDArray[np.uint8], Array | None]]:
+    """Images of the board with its pose (4, 4) in the base frame as measured, None for a held board."""
+    board = board or Chessboard()
+    table = cell["table"]
+    for along, y, turn in LAID:
+        place = np.array([table["near_edge"] + along, y, table["top"]])
+        measured = _centred(place, _turned(0.0, 0.0, turn), board)
+        shift = np.array([*rng.normal(0.0, PLACEMENT, 2), 0.0])
+        true = _centred(place + shift, _turned(0.0, 0.0, turn + float(rng.normal(0.0, DIRECTION))), board)
+        true[2, 3] = camera.table.top
+        yield camera.render_board(true, board), measured
+    for along, y, above, *turns in HELD:
+        place = np.array([table["near_edge"] + along, y, table["top"] + above])
+        yield camera.render_board(_centred(place, _turned(*turns), board), board), None
+
+
+def _centred(place: Array, rotation: Array, board: Chessboard) -> Array:
+    """Pose of a board whose middle is at `place`."""
+    middle = np.array([(board.columns - 1) / 2, (board.rows - 1) / 2, 0.0]) * board.square
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, place - rotation @ middle
+    return pose
+
+
+def _turned(x: float, y: float, z: float) -> Array:
+    """Rotation by z, then y, then x about the moving axes (rad)."""
+    (cx, sx), (cy, sy), (cz, sz) = ((np.cos(angle), np.sin(angle)) for angle in (x, y, z))
+    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cx, -sx], [0.0, sx, cx]])
+    about_y = np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
+    about_z = np.array([[cz, -sz, 0.0], [sz, cz, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(about_z @ about_y @ about_x)
