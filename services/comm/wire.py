@@ -182,6 +182,10 @@ class Connection:
             self._enter(_Phase.CLOSING)
         return data
 
+    def refusal(self, refuse: Refuse) -> bytes:
+        """Bytes of the last word to a side that has broken the protocol, sealed if the connection was open."""
+        return self._frame(encode(refuse))
+
     def _frame(self, body: bytes) -> bytes:
         if self._seal_out is None:
             return len(body).to_bytes(_HEADER, "big") + body

@@ -1,0 +1,247 @@
+"""The connecting end: a `Caller` on asyncio, connected again and again until it is closed.
+
+client = Client("127.0.0.1", 7001, caller, on_notices=executor.take)
+client.start()
+caller.call(client.now(), Call(...)); client.flush()      # its end comes as a notice
+outcome = await client.call("memory.get", {"name": "x"})  # or as an awaited outcome
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import random
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from services.comm.caller import Caller, Ended, Notice
+from services.comm.link import Limits, Link, Timing
+from services.comm.messages import Bye, Call, Executed, Message, Outcome, Refuse, Welcome
+from services.comm.wire import ProtocolError, Side, State
+
+OnNotices = Callable[[float, list[Notice]], None]
+_NO_ARGUMENTS: Mapping[str, Any] = {}
+
+
+class _ClientLink(Link):
+    """One connection to the peer."""
+
+    def __init__(self, client: Client) -> None:
+        super().__init__(Side.CLIENT, client.key, client.timing, client.limits)
+        self._client = client
+        self.finished = self.loop.create_future()
+        self.refusal: Refuse | None = None
+        self.welcome = False
+
+    def made(self) -> None:
+        self.send((self._client.caller.hello,))
+
+    def took(self, now: float, messages: list[Message]) -> None:
+        client = self._client
+        for message in messages:
+            if isinstance(message, Welcome):
+                self.welcome = True
+                self.opened()
+                client.welcomed(now, self, message)
+            elif isinstance(message, Refuse):
+                self.refusal = message
+            elif not isinstance(message, Bye):
+                client.caller.receive(now, message)
+        client.flush(now)
+
+    def unsendable(self, message: Message, fault: ProtocolError) -> Message | None:
+        if isinstance(message, Call):
+            outcome = Outcome(message.id, "error", {}, fault.code, fault.text, Executed.NO)
+            self._client.caller.receive(self.loop.time(), outcome)
+        return None
+
+    def faulted(self, opening: bool, fault: ProtocolError) -> None:
+        if opening:
+            self.refusal = Refuse(fault.code, fault.text)
+
+    def over(self, now: float) -> None:
+        if not self.finished.done():
+            self.finished.set_result(None)
+        self._client.gone(now, self)
+
+
+class Client:
+    """Keeps a caller connected to its peer. `on_notices(now, notices)` gets what the caller has to tell, in the loop,
+    but for the ends of calls made by `call`.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        caller: Caller,
+        *,
+        on_notices: OnNotices | None = None,
+        key: bytes | None = None,
+        timing: Timing | None = None,
+        limits: Limits | None = None,
+    ) -> None:
+        self.host = host
+        self.port = port
+        self.caller = caller
+        self.key = key
+        self.timing = timing or Timing()
+        self.limits = limits or Limits()
+        self._on_notices = on_notices
+        self._link: _ClientLink | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._flushing = False
+        self._futures: dict[str, asyncio.Future[Outcome]] = {}
+        self._numbers = 0
+        self._up = asyncio.Event()
+        self._loop = asyncio.get_running_loop()
+
+    def now(self) -> float:
+        """The clock that the caller lives by: monotonic, of the loop (s)."""
+        return self._loop.time()
+
+    def start(self) -> None:
+        """Begin to connect."""
+        self.caller.connecting(self.now())
+        self._task = self._loop.create_task(self._connect_for_ever())
+
+    async def connected(self, timeout: float) -> bool:
+        """Whether the peer has welcomed us, waiting for it at most `timeout` seconds."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout):
+                await self._up.wait()
+        return self._up.is_set()
+
+    async def close(self, text: str = "the caller stops") -> None:
+        """Say good-bye; calls under way end as lost."""
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.gather(self._task, return_exceptions=True)
+        link = self._link
+        if link is not None:
+            link.end(text, Bye(text) if link.connection.state is State.OPEN else None)
+            await link.finished
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        self.caller.link_down(self.now(), text, final=True)
+        self._tell(self.now())
+
+    # Calls.
+
+    async def call(
+        self,
+        service: str,
+        arguments: Mapping[str, Any] = _NO_ARGUMENTS,
+        *,
+        deadline: float | None = None,
+        parent: str = "",
+        seed: int = 0,
+    ) -> Outcome:
+        """Call a service and wait for its outcome, which is acknowledged then. Cancelled, it cancels the call."""
+        self._numbers += 1
+        caller = self.caller
+        id_ = f"{caller.hello.name}/{caller.hello.boot}/{self._numbers}"
+        future: asyncio.Future[Outcome] = self._loop.create_future()
+        now = self._loop.time()
+        caller.call(now, Call(id_, service, arguments, deadline, 0, "", parent, seed))
+        self._futures[id_] = future
+        if len(self._futures) == 1:
+            self.flush(now)
+        elif not self._flushing:
+            # Others are under way: let those that are made in this turn of the loop share one write.
+            self._flushing = True
+            self._loop.call_soon(self._flush_soon)
+        try:
+            return await future
+        except asyncio.CancelledError:
+            caller.cancel(self.now(), id_, "its caller gave up")
+            self.flush()
+            raise
+
+    def _flush_soon(self) -> None:
+        self._flushing = False
+        self.flush()
+
+    def flush(self, now: float | None = None) -> None:
+        """Send the caller's messages and tell its notices; call it after each use of the caller."""
+        now = self._loop.time() if now is None else now
+        messages = self.caller.messages(now)
+        if messages and self._link is not None:
+            self._link.send(messages)
+        self._tell(now)
+        self._arm()
+
+    def _tell(self, now: float) -> None:
+        notices = self.caller.notices()
+        if not notices:
+            return
+        futures = self._futures
+        rest: list[Notice] = []
+        for notice in notices:
+            if type(notice) is Ended and notice.outcome.id in futures:
+                outcome = notice.outcome
+                future = futures.pop(outcome.id)
+                if not future.done():
+                    future.set_result(outcome)
+                self.caller.acknowledge(now, outcome.id)
+            else:
+                rest.append(notice)
+        if rest and self._on_notices is not None:
+            self._on_notices(now, rest)
+
+    def _arm(self) -> None:
+        due = self.caller.due()
+        if due is None or (self._timer is not None and self._timer.when() <= due):
+            return
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = self._loop.call_at(due, self._advance)
+
+    def _advance(self) -> None:
+        self._timer = None
+        now = self.now()
+        self.caller.advance(now)
+        self.flush(now)
+
+    # The connection.
+
+    async def _connect_for_ever(self) -> None:
+        first, longest = self.timing.backoff
+        pause = first
+        while True:
+            link = await self._connect()
+            if link is not None:
+                await link.finished
+                if link.welcome:
+                    pause = first
+            # A little chance, so that many clients do not come back in one moment.
+            await asyncio.sleep(pause * random.uniform(0.5, 1.0))
+            pause = min(2.0 * pause, longest)
+
+    async def _connect(self) -> _ClientLink | None:
+        try:
+            async with asyncio.timeout(self.timing.silence):
+                _, link = await self._loop.create_connection(lambda: _ClientLink(self), self.host, self.port)
+        except (OSError, TimeoutError):
+            return None
+        self._link = link
+        return link
+
+    def welcomed(self, now: float, link: _ClientLink, welcome: Welcome) -> None:
+        """A link was welcomed."""
+        self._link = link
+        self._up.set()
+        self.caller.link_up(now, welcome)
+
+    def gone(self, now: float, link: _ClientLink) -> None:
+        """A link is over."""
+        if self._link is link:
+            self._link = None
+        self._up.clear()
+        if link.refusal is not None:
+            self.caller.link_refused(now, link.refusal)
+        else:
+            self.caller.link_down(now, link.reason, final=link.silent)
+        self.flush(now)

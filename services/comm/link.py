@@ -1,0 +1,274 @@
+"""One asyncio connection: bytes to a `Connection` and back, heartbeat, limits. Server and client build on it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import secrets
+import socket
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import Enum, auto
+
+from services.comm.messages import Bye, Event, Feedback, Message, Ping, Pong, Refuse
+from services.comm.security import NONCE_BYTES
+from services.comm.wire import Connection, ProtocolError, Side, State
+
+_HEARTBEATS = frozenset((Ping, Pong))
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """Of a link (s)."""
+
+    heartbeat: float = 0.25
+    """Silence after which PING is sent,"""
+    silence: float = 1.0
+    """and after which the other side counts as frozen or cut."""
+    handshake: float = 2.0
+    """From connection to WELCOME."""
+    user_timeout: float = 1.5
+    """TCP_USER_TIMEOUT: unacknowledged data for so long breaks the connection."""
+    backoff: tuple[float, float] = (0.05, 1.0)
+    """First and longest pause between attempts to connect."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Of a server and its links."""
+
+    connections: int = 256
+    opening: int = 64
+    """Connections that have not shown who they are; above it the oldest of them gives way."""
+    buffer_high: int = 1 << 20
+    """Bytes waiting to be sent above which a link is slow: progress and pulses are dropped, no more is read from it,"""
+    buffer_hard: int = 64 << 20
+    """and above which it is cut."""
+
+
+class Beat(Enum):
+    """What a heart wants."""
+
+    NOTHING = auto()
+    PING = auto()
+    LOST = auto()
+
+
+class Heart:
+    """Silence of the other side, as a machine without clock."""
+
+    __slots__ = ("_due", "_heard", "_timing")
+
+    def __init__(self, now: float, timing: Timing) -> None:
+        self._timing = timing
+        self._heard = now
+        self._due = now + timing.heartbeat
+
+    def hear(self, now: float) -> None:
+        """Something came."""
+        self._heard = now
+
+    def advance(self, now: float) -> Beat:
+        """What to do at `now`; call it when `due`."""
+        late = now - self._due
+        if late > self._timing.silence / 2:
+            # This process itself stood still: what the other side said meanwhile may still lie in the socket.
+            self._heard = max(self._heard, now - self._timing.silence + self._timing.heartbeat)
+        silent = now - self._heard
+        if silent >= self._timing.silence:
+            return Beat.LOST
+        self._due = min(now + self._timing.heartbeat, self._heard + self._timing.silence)
+        return Beat.PING if silent >= self._timing.heartbeat else Beat.NOTHING
+
+    def due(self) -> float:
+        """When to call `advance` next (s)."""
+        return self._due
+
+
+class Link(asyncio.Protocol):
+    """Base of both ends. Subclasses take messages in `took`, the end of the link in `over`."""
+
+    def __init__(self, side: Side, key: bytes | None, timing: Timing, limits: Limits) -> None:
+        nonce = secrets.token_bytes(NONCE_BYTES) if key is not None else b""
+        self.connection = Connection(side, key=key, nonce=nonce)
+        self.loop = asyncio.get_running_loop()
+        self.timing = timing
+        self.limits = limits
+        self.slow = False
+        self.reason = ""
+        """Why the link is over."""
+        self.silent = False
+        """Whether it is over because the other side was silent."""
+        self._transport: asyncio.Transport | None = None
+        self._heart = Heart(0.0, timing)
+        self._timer: asyncio.TimerHandle | None = None
+        self._pings = 0
+
+    # For subclasses.
+
+    def made(self) -> None:
+        """The connection stands."""
+
+    def took(self, now: float, messages: list[Message]) -> None:
+        """Messages came."""
+
+    def over(self, now: float) -> None:
+        """The link is over, `reason` says why. Called once."""
+
+    def unsendable(self, message: Message, fault: ProtocolError) -> Message | None:
+        """No frame can carry this message; gives what is sent in its place."""
+        return None
+
+    # What asyncio calls.
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+        transport.set_write_buffer_limits(high=self.limits.buffer_high)
+        sock = transport.get_extra_info("socket")
+        if sock is not None and sock.family in (socket.AF_INET, socket.AF_INET6):
+            _tune(sock, self.timing)
+        now = self.loop.time()
+        self._timer = self.loop.call_at(now + self.timing.handshake, self._handshake_over)
+        self.made()
+
+    def data_received(self, data: bytes) -> None:
+        now = self.loop.time()
+        self._heart.hear(now)
+        connection = self.connection
+        was_opening = connection.state is State.OPENING
+        try:
+            messages = connection.receive_data(data)
+        except ProtocolError as fault:
+            self._refuse(now, fault)
+            return
+        if was_opening and self._transport is not None and (out := connection.data_to_send()):
+            self._transport.write(out)
+        self._sort(now, messages)
+
+    def _sort(self, now: float, messages: list[Message]) -> None:
+        """Heartbeats stay here; an end ends the link after what came before it was taken."""
+        if not messages:
+            return
+        last = messages[-1]
+        pings = [message for message in messages if type(message) in _HEARTBEATS]
+        if pings:
+            messages = [message for message in messages if type(message) not in _HEARTBEATS]
+            self.send([Pong(ping.number) for ping in pings if type(ping) is Ping])
+        if messages:
+            self.took(now, messages)
+        if isinstance(last, Refuse):
+            self.end(f"{last.code}: {last.text}")
+        elif isinstance(last, Bye):
+            self.end(last.text or "it left")
+
+    def pause_writing(self) -> None:
+        self.slow = True
+        if self.connection.side is Side.SERVER and self._transport is not None:
+            self._transport.pause_reading()
+
+    def resume_writing(self) -> None:
+        self.slow = False
+        if self.connection.side is Side.SERVER and self._transport is not None:
+            self._transport.resume_reading()
+
+    def connection_lost(self, fault: Exception | None) -> None:
+        if not self.reason:
+            self.reason = f"the connection broke: {fault}" if fault is not None else "the other side hung up"
+        if self._timer is not None:
+            self._timer.cancel()
+        self._transport = None
+        self.over(self.loop.time())
+
+    # What the owner asks for.
+
+    def opened(self) -> None:
+        """The handshake is over: the heart beats from now on."""
+        now = self.loop.time()
+        self._heart = Heart(now, self.timing)
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = self.loop.call_at(self._heart.due(), self._beat)
+
+    def send(self, messages: Iterable[Message]) -> None:
+        """Send messages in one write. One that no frame can carry is answered for by `unsendable`."""
+        transport = self._transport
+        if transport is None or transport.is_closing():
+            return
+        transport.write(b"".join([self._bytes(message) for message in messages]))
+        if self.slow and transport.get_write_buffer_size() > self.limits.buffer_hard:
+            self.cut(f"it does not read: {self.limits.buffer_hard} bytes wait for it")
+
+    def _bytes(self, message: Message) -> bytes:
+        if self.slow and (type(message) is Feedback or (type(message) is Event and not message.number)):
+            return b""
+        try:
+            return self.connection.send(message)
+        except ProtocolError as fault:
+            instead = self.unsendable(message, fault)
+            return b"" if instead is None else self.connection.send(instead)
+
+    def end(self, reason: str, last: Message | None = None) -> None:
+        """Say a last word (Bye, Refuse) and close once it is out."""
+        transport = self._transport
+        if transport is None:
+            return
+        self.reason = self.reason or reason
+        if last is not None and not transport.is_closing():
+            with contextlib.suppress(ProtocolError):
+                transport.write(self.connection.send(last))
+        transport.close()
+
+    def cut(self, reason: str) -> None:
+        """Close at once."""
+        self.reason = self.reason or reason
+        if self._transport is not None:
+            self._transport.abort()
+
+    def ends(self) -> tuple[str, str]:
+        """Addresses of the other and of this end; empty where there are none."""
+        if self._transport is None:
+            return "", ""
+        return _host(self._transport.get_extra_info("peername")), _host(self._transport.get_extra_info("sockname"))
+
+    def _refuse(self, now: float, fault: ProtocolError) -> None:
+        opening = self.connection.version == 0
+        self._sort(now, list(fault.before))
+        # The connection is closed for its part already; a sealed one could only be answered with a seal.
+        self.reason = self.reason or str(fault)
+        if self._transport is not None and not self._transport.is_closing():
+            refusal = self.connection.refusal(Refuse(fault.code, fault.text[:500]))
+            self._transport.write(refusal)
+            self._transport.close()
+        self.faulted(opening, fault)
+
+    def faulted(self, opening: bool, fault: ProtocolError) -> None:
+        """The other side broke the protocol (for subclasses that count)."""
+
+    def _handshake_over(self) -> None:
+        self.cut(f"no handshake in {self.timing.handshake:g} s")
+
+    def _beat(self) -> None:
+        now = self.loop.time()
+        beat = self._heart.advance(now)
+        if beat is Beat.LOST:
+            self.silent = True
+            self.cut(f"silent for {self.timing.silence:g} s: frozen or cut off")
+            return
+        self._timer = self.loop.call_at(self._heart.due(), self._beat)
+        if beat is Beat.PING:
+            self._pings += 1
+            self.send((Ping(self._pings),))
+
+
+def _host(address: object) -> str:
+    return str(address[0]) if isinstance(address, tuple) and address else ""
+
+
+def _tune(sock: socket.socket, timing: Timing) -> None:
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 1)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 1)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(timing.user_timeout * 1000))
