@@ -68,7 +68,8 @@ class Cancelled(BaseException):
 class Wait:
     """What an action's coroutine yields: go on when `ready()` holds or when the clock reaches `due` (s; None: never).
 
-    Awaiting it gives True if it was ready, False if its time was over.
+    Awaiting it gives True if it was ready, False if its time was over. Who runs the action sends that verdict, so that
+    `ready` is asked no more once it held (it may have taken what it found); sent None, it is asked again.
     """
 
     __slots__ = ("due", "ready")
@@ -77,9 +78,9 @@ class Wait:
         self.ready = ready
         self.due = due
 
-    def __await__(self) -> Generator[Wait, None, bool]:
-        yield self
-        return self.ready()
+    def __await__(self) -> Generator[Wait, bool | None, bool]:
+        verdict = yield self
+        return self.ready() if verdict is None else verdict
 
 
 class Context(Protocol):

@@ -8,7 +8,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-_OURS = {str(Path(__file__).with_name(name)) for name in ("runner.py", "execution.py", "context.py", "outlets.py", "callables.py")}
+_OURS = {
+    str(Path(__file__).with_name(name))
+    for name in ("runner.py", "execution.py", "context.py", "outlets.py", "callables.py")
+}
 
 
 def check_arguments(function: Callable[..., Any], arguments: Mapping[str, Any]) -> None:

@@ -50,7 +50,7 @@ class Execution:
     entry: ActionEntry
     phase: Phase = Phase.NEW
     context: RunContext | None = None
-    coroutine: Coroutine[Wait, None, Any] | None = None
+    coroutine: Coroutine[Wait, bool | None, Any] | None = None
     wait: Wait | None = None
     started: float = 0.0
     limit: float | None = None
@@ -92,35 +92,40 @@ class Execution:
         if self.wait is None:
             return
         try:
-            over = self.wait.ready() or (self.wait.due is not None and now >= self.wait.due)
+            ready = self.wait.ready()
         except Exception as fault:
             self.go_on(fault)
             return
-        if over:
-            self.go_on(None)
+        if ready or (self.wait.due is not None and now >= self.wait.due):
+            self.go_on(ready)
 
-    def go_on(self, throw: BaseException | None) -> None:
-        """Run until it waits for something that is not there yet; `throw` is raised at its wait. Raises as `call` does."""
+    def go_on(self, verdict: bool | BaseException | None) -> None:
+        """Tell its wait the verdict (or raise it there), and run until it waits for something that is not there yet.
+
+        Raises as `call` does.
+        """
         for _ in range(STEPS):
-            self.wait = self._resume(throw)
-            throw = None
+            self.wait = self._resume(verdict)
             if not self.wait.ready():
                 return
+            verdict = True
         raise RuntimeError(f"went on {STEPS} times without time passing")
 
-    def _resume(self, throw: BaseException | None) -> Wait:
+    def _resume(self, verdict: bool | BaseException | None) -> Wait:
         coroutine = self.coroutine
         assert coroutine is not None
         for _ in range(STEPS):
             try:
-                step = partial(coroutine.send, None) if throw is None else partial(coroutine.throw, throw)
-                wait: Any = self._timed(step)
+                if isinstance(verdict, BaseException):
+                    wait: Any = self._timed(partial(coroutine.throw, verdict))
+                else:
+                    wait = self._timed(partial(coroutine.send, verdict))
             except StopIteration as returned:
                 self.coroutine = self.wait = None
                 raise Returned(returned.value) from None
             if isinstance(wait, Wait):
                 return wait
-            throw = TypeError(f"awaits a {type(wait).__name__}; an action awaits only what its context gives it")
+            verdict = TypeError(f"awaits a {type(wait).__name__}; an action awaits only what its context gives it")
         raise RuntimeError("awaits only what its context did not give it")
 
     def close(self) -> str:

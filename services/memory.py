@@ -98,4 +98,3 @@ def _checked(name: Any) -> str:
     if not isinstance(name, str) or not 0 < len(name) <= NAME_LENGTH:
         raise TypeError(f"name is {name!r:.40}; give a text of 1 to {NAME_LENGTH} characters")
     return name
-

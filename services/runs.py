@@ -113,15 +113,26 @@ class Sent:
     """A set point leaves: the newest value of a stream and how long ago its action published it (s)."""
 
     KIND: ClassVar[str] = "sent"
+    run: str
     stream: str
     values: tuple[float, ...]
     elapsed: float
 
 
+@dataclass(frozen=True, slots=True)
+class Told:
+    """Answer to an operator's command: a word, and data about the device and its runs."""
+
+    KIND: ClassVar[str] = "told"
+    id: str
+    answer: str
+    data: Mapping[str, Any] = field(default_factory=dict)
+
+
 Order = Begin | Stop | Answered | Hold
-Report = Ended | Progressed | Raised | Asked | Dropped | Sent
+Report = Ended | Progressed | Raised | Asked | Dropped | Sent | Told
 _RECORDS: dict[str, type[Order] | type[Report]] = {
-    kind.KIND: kind for kind in (Begin, Stop, Answered, Hold, Ended, Progressed, Raised, Asked, Dropped, Sent)
+    kind.KIND: kind for kind in (Begin, Stop, Answered, Hold, Ended, Progressed, Raised, Asked, Dropped, Sent, Told)
 }
 
 

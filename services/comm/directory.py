@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import importlib
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from services.comm import directory_file
-from services.comm.party import TICK, Envelope
+from services.comm.party import TICK
 
 MEMORY = "memory"
 MEMORY_CALLS = ("memory.get", "memory.put", "memory.compare_and_set", "memory.list")
@@ -111,7 +112,7 @@ class Directory:
     streams: Mapping[str, StreamEntry]
     timers: Mapping[str, TimerEntry]
     links: Mapping[str, float]
-    """Lock-step delays (s) by "source -> target", endpoint, channel or "default"."""
+    """Lock-step delays (s) by channel or "source/target" (endpoint names)."""
     keys: Mapping[str, str]
     parameters: Mapping[str, str]
     """Files of numbers that the cell's programs share, by name; relative to this file."""
@@ -126,6 +127,13 @@ class Directory:
                 return str(table[key].node)
         known = [*self.actions, *self.services, *self.devices, *self.timers, *self.streams]
         raise DirectoryError((f"{self.source}: nothing is named {name!r}{directory_file.nearest(key, known)}",))
+
+    def party(self, endpoint: str) -> str:
+        """Lock step: the party that an endpoint lives in; a name that stands in no table is a party itself."""
+        try:
+            return endpoint if endpoint in self.nodes else self.where(endpoint)
+        except DirectoryError:
+            return endpoint
 
     def offers(self, node: str) -> tuple[str, ...]:
         """Names of all actions and services that a node answers to."""
@@ -144,6 +152,14 @@ class Directory:
         entry = self.nodes[node]
         return entry.host, entry.port
 
+    def same_host(self, node: str, party: str) -> bool:
+        """Whether a party lives on a node's host; one that is no node (a coordinator in lock step) does."""
+        return party not in self.nodes or self.nodes[party].host == self.nodes[node].host
+
+    def laboratory(self) -> str:
+        """The simulated node, empty when there is none."""
+        return next((n.name for n in self.nodes.values() if n.sim), "")
+
     def local(self, service: str) -> bool:
         """Whether only callers of the same host may call it."""
         key = MEMORY if service in MEMORY_CALLS else service
@@ -153,13 +169,9 @@ class Directory:
         """A path written in services.toml, taken relative to it."""
         return self.source.parent / path
 
-    def delay(self, envelope: Envelope) -> float:
-        """Lock step: how long an envelope is on its way (s), by the most specific entry of `[links]`; at least a tick."""
-        pair = f"{envelope.source} -> {envelope.target}"
-        for key in (pair, envelope.source, envelope.target, envelope.channel, "default"):
-            if key in self.links:
-                return self.links[key]
-        return TICK
+    def delays(self) -> dict[str, int]:
+        """Lock-step delays of the links in whole ticks, rounded up, as `services.comm.cell.Delays` takes them."""
+        return {name: max(1, math.ceil(seconds / TICK - 1e-6)) for name, seconds in self.links.items()}
 
 
 def load(path: str | Path) -> Directory:

@@ -97,6 +97,7 @@ FLAT: Mapping[str, Key] = {
     "keys": Key("a text", _text),
     "parameters": Key("the path of a file, relative to this one", _text),
 }
+CHANNELS = ("call", "can", "image", "stream", "control")
 TOP = ("schema", *SHAPES, *FLAT)
 
 
@@ -149,6 +150,9 @@ def read(text: str, source: str, memory: str) -> tuple[Tables, str, list[str]]:
         for name, value in tables[table].items():
             if not key.fits(value):
                 faults.add(f"{table}.{name}", f"is {value!r}; write {key.wants}")
+    for name in tables["links"]:
+        if "/" not in name and name not in CHANNELS:
+            faults.add(f"links.{name}", f'unknown link; write a channel or "source/target"{nearest(name, CHANNELS)}')
     if not faults.lines:
         _check_places(tables, faults, memory)
         _check_names(tables, faults)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,6 +14,10 @@ from services.comm.directory import ActionEntry
 from services.comm.party import TICK
 from services.runner import Runner
 from services.runs import Answered, Begin, Ended, Order, Report
+
+OUTSIDE = Path(__file__).parent / "outside"
+"""Stands for the folder of a laboratory's own packages."""
+sys.path.append(str(OUTSIDE))
 
 
 @dataclass

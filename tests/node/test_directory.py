@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from services.comm.directory import MEMORY_CALLS, Directory, DirectoryError, load, parse, verify_imports
-from services.comm.party import TICK, Envelope
 
 GOOD = """\
 schema = 1
@@ -61,9 +60,9 @@ period = 0.02
 node = "vision"
 period = 0.04
 [links]
-default = 0.008
+call = 0.008
 image = 0.2
-"look -> world" = 0.4
+"look/world" = 0.4001
 """
 
 
@@ -90,22 +89,8 @@ def test_hash_is_of_the_data_not_of_the_text() -> None:
     assert parse(GOOD.replace("7301", "7303"), Path("services.toml")).hash != good().hash
 
 
-@pytest.mark.parametrize(
-    ("source", "target", "channel", "delay"),
-    [
-        ("look", "world", "call", 0.4),
-        ("look", "other", "call", 0.008),
-        ("world", "eye", "image", 0.2),
-        ("a", "b", "can", 0.008),
-    ],
-)
-def test_link_delays_by_the_most_specific_entry(source: str, target: str, channel: str, delay: float) -> None:
-    assert good().delay(Envelope("anywhere", source, target, channel, None)) == delay
-
-
-def test_a_link_takes_a_tick_when_nothing_is_said() -> None:
-    bare = parse(GOOD[: GOOD.index("[links]")], Path("services.toml"))
-    assert bare.delay(Envelope("p", "a", "b", "call", None)) == TICK
+def test_link_delays_are_whole_ticks() -> None:
+    assert good().delays() == {"call": 2, "image": 50, "look/world": 101}
 
 
 FAULTS = [
@@ -119,7 +104,7 @@ FAULTS = [
     ("port = 7301", "prot = 7301", "nodes.vision.prot: unknown key; did you mean 'port'?"),
     ('node = "vision"\ndriver', 'node = "vison"\ndriver', "no node is named 'vison'; did you mean 'vision'?"),
     ('driver = "json:JSONDecoder"\n', "", 'devices.eye.driver: is missing; write an import path "module:Class"'),
-    ('"json:JSONDecoder"', '"json.JSONDecoder"', 'devices.eye.driver: is \'json.JSONDecoder\'; write an import path'),
+    ('"json:JSONDecoder"', '"json.JSONDecoder"', "devices.eye.driver: is 'json.JSONDecoder'; write an import path"),
     ('device = "eye"\ndeadline', 'device = "ear"\ndeadline', "actions.look.device: no device is named 'ear'"),
     ('device = "eye"\ndeadline', "deadline", 'actions.look: is on no node; write device = "..."'),
     ('device = "eye"\ndeadline', 'device = "eye"\nnode = "motion"\ndeadline', "actions.look.node: is on two nodes"),
@@ -137,12 +122,17 @@ FAULTS = [
     ('to = "hand"', 'to = "foot"', "streams.where.to: no device is named 'foot'"),
     ("period = 0.02", "period = -1", "streams.where.period: is -1; write a number of seconds above 0"),
     ("period = 0.04\n", "", "timers.beat.period: is missing; write a number of seconds above 0"),
-    ("default = 0.008", "default = 0.001", "links.default: is 0.001; write a delay in seconds, 0.004 (one tick) or more"),
+    ("call = 0.008", "call = 0.001", ":51: links.call: is 0.001; write a delay in seconds, 0.004 (one tick) or more"),
+    (
+        "call = 0.008",
+        "cal = 0.008",
+        "links.cal: unknown link; write a channel or \"source/target\"; did you mean 'call'?",
+    ),
     ('cell = "cell.toml"', "cell = 3", "parameters.cell: is 3; write the path of a file, relative to this one"),
     ("[devices.hand]", '[devices."a hand"]', "a name has letters, digits, _ and - only"),
     ("port = 7301", "port = ", ":6: not valid TOML"),
     (GOOD, "schema = 1\n", "nodes: there is no node; write at least one [nodes.NAME]"),
-    ("[links]\ndefault = 0.008\nimage", "links = 3\n[links_]\nimage", "links"),
+    ("[links]\ncall = 0.008\n", "[links_]\n", "links_: unknown table; did you mean 'links'?"),
 ]
 
 
@@ -177,7 +167,10 @@ def test_an_unreadable_file_raises_what_the_system_says(tmp_path: Path) -> None:
     [
         ("json:JSONDecode", "'json' has no callable 'JSONDecode'; did you mean 'JSONDecoder'?"),
         ("jsonn:loads", "cannot import 'jsonn' (No module named 'jsonn'); install its package on this host"),
-        ("broken_driver:Driver", "importing 'broken_driver' raises ZeroDivisionError: division by zero; mend the module"),
+        (
+            "broken_driver:Driver",
+            "importing 'broken_driver' raises ZeroDivisionError: division by zero; mend the module",
+        ),
     ],
 )
 def test_imports_are_verified_on_the_host_that_runs_them(

@@ -80,7 +80,14 @@ ENDINGS: list[tuple[Any, dict[str, Any], str, str, str, str]] = [
     (naps, {}, "success", "", "", "yes"),
     (raises, {}, "error", "exception", "KeyError: 'missing' in raises (test_runner.py:", "yes"),
     (raises_later, {}, "error", "exception", "ConnectionError: the bus is gone in raises_later", "yes"),
-    (awaits_foreign, {}, "error", "exception", "awaits a Foreign; an action awaits only what its context gives it", "yes"),
+    (
+        awaits_foreign,
+        {},
+        "error",
+        "exception",
+        "awaits a Foreign; an action awaits only what its context gives it",
+        "yes",
+    ),
     (spins, {}, "error", "exception", "times without time passing", "yes"),
     (bad_wait, {}, "error", "exception", "ZeroDivisionError", "yes"),
     (leaves, {}, "error", "exception", "SystemExit: 3", "yes"),
@@ -287,9 +294,7 @@ def test_never_two_runs_on_a_device_and_each_ends_once(
     clock = Clock()
     device = Device(clock, halting)
     entries = {k: action(k) for k in ("wait", "stubborn", "raise", "quick")}
-    runner = Runner(
-        {k: _entry(k) for k in entries}, clock=clock, device=device, substitutes=entries, virtual=True
-    )
+    runner = Runner({k: _entry(k) for k in entries}, clock=clock, device=device, substitutes=entries, virtual=True)
     ended: list[str] = []
     for tick in range(60 + int((GRACE + STOP_LIMIT + 0.5) / TICK)):
         clock.now = tick * TICK

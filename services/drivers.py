@@ -1,0 +1,23 @@
+"""Makes the driver of a device from services.toml; whatever it does not like is one fault that names the device."""
+
+from __future__ import annotations
+
+from services.comm.directory import DeviceEntry, Directory, DirectoryError, resolve
+from services.device import Driver, Ports
+
+
+def make_driver(directory: Directory, device: DeviceEntry, ports: Ports) -> Driver:
+    """The device's driver, `Class(config, ports)`. Raises DirectoryError naming the device, its driver and what was wrong."""
+    here = f"{directory.source}: devices.{device.name}"
+    try:
+        driver: Driver = resolve(device.driver)(device.config, ports)
+    except ImportError as fault:
+        raise DirectoryError((f"{here}.driver: {fault}",)) from fault
+    except (KeyError, TypeError, ValueError, OSError) as fault:
+        told = f"is missing {fault}" if isinstance(fault, KeyError) else str(fault)
+        raise DirectoryError((f"{here}: {device.driver} refuses it: {told}; mend the keys of this table",)) from fault
+    missing = [m for m in ("period", "state", "stop", "stopped", "hold", "release", "close") if not hasattr(driver, m)]
+    if missing:
+        text = f"{device.driver} is no driver: it has no {', '.join(missing)}; see services/device.py"
+        raise DirectoryError((f"{here}.driver: {text}",))
+    return driver

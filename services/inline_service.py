@@ -1,0 +1,50 @@
+"""A general-purpose service written as a plain function, answered on the spot in the node's loop."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from services.action import Result, Status
+from services.callables import check_arguments, describe
+from services.comm.callee import Inline
+from services.comm.directory import ServiceEntry, resolve
+from services.comm.messages import Call, Executed, Outcome
+from services.context import RunContext
+from services.outlets import Outlets
+from services.runs import Begin, Raised, Report
+
+EventSink = Callable[[str, str, Mapping[str, Any]], None]
+"""Takes (service, event, data) of an event that a service raises."""
+
+
+def inline_service(service: ServiceEntry, raised: EventSink) -> Inline:
+    """The callee's end of such a service. Raises ImportError when its function cannot be loaded.
+
+    The function takes a context and keyword arguments like an action; of its context it may use what does not wait.
+    """
+    function = resolve(service.run)
+
+    def report(told: Report) -> None:
+        if isinstance(told, Raised):
+            raised(service.name, told.name, told.data)
+
+    def answer(now: float, call: Call) -> Outcome:
+        context = RunContext(Begin(call.id, service.name, call.arguments), None, lambda: now, Outlets({}), report)
+        try:
+            check_arguments(function, call.arguments)
+        except TypeError as fault:
+            return Outcome(call.id, Status.ERROR, {}, "bad_arguments", f"{service.name}: {fault}", Executed.NO)
+        before = time.process_time()
+        try:
+            result = function(context, **call.arguments)
+        except Exception as fault:
+            return Outcome(call.id, Status.ERROR, {}, "exception", describe(fault))
+        if not isinstance(result, Result):
+            text = f"returned a {type(result).__name__}; return success(), failure() or error()"
+            return Outcome(call.id, Status.ERROR, {}, "bad_result", text)
+        cpu = time.process_time() - before
+        return Outcome(call.id, result.status, result.values, result.cause, result.text, cpu_seconds=cpu)
+
+    return answer

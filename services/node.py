@@ -1,0 +1,261 @@
+"""A node as one machine for lock step and real time: its offers, the places of its runs, its memory, timers and calls."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from services.action import Status
+from services.comm.callee import Callee, CancelRun, Commanded, Inline, Offer, StartRun
+from services.comm.caller import Caller
+from services.comm.directory import MEMORY, MEMORY_CALLS, ActionEntry, Directory, DirectoryError, ServiceEntry, resolve
+from services.comm.messages import Call, Executed, Hello, Outcome
+from services.comm.notice import Ended as CallEnded
+from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
+from services.inline_service import inline_service
+from services.memory import Memory, event_name
+from services.place import InlinePlace, Place
+from services.runs import Answered, Asked, Begin, Dropped, Ended, Progressed, Raised, Report, Sent, Stop, Told
+from services.timers import Timers
+
+GENERAL = ""
+"""Key of the place of actions that need no device."""
+LOOP = "*"
+"""Key of the place of services that wait, in the node's own loop."""
+ANSWER_WITHIN = 1.0
+"""Seconds that the devices have to answer an operator's command."""
+_OWN_CAUSES = ("deadline", "orphan")
+_WELL_HELD = ("held", "stopped")
+
+
+@dataclass
+class _Commanded:
+    """An operator's command under way: whose answers are missing, and those that are there."""
+
+    verb: str
+    due: float
+    missing: set[str]
+    answers: dict[str, str] = field(default_factory=dict)
+    data: dict[str, Any] = field(default_factory=dict)
+
+
+class Node:
+    """Everything of a node but sockets, processes and the clock.
+
+    `callee` and `callers` (one for each peer) are driven by a shell: it brings them what comes in and takes out what goes.
+    `places` are by device, `GENERAL` for actions without. Then `advance(now)` does all that is due; `due()` says when next.
+    """
+
+    def __init__(
+        self,
+        directory: Directory,
+        name: str,
+        *,
+        boot: str,
+        clock: Callable[[], float],
+        places: Mapping[str, Place],
+        virtual: bool = False,
+    ) -> None:
+        self.directory = directory
+        self.name = name
+        self.boot = boot
+        services = [s for s in directory.services.values() if s.node == name and s.run]
+        waiting = {s.name: _as_action(s) for s in services if inspect.iscoroutinefunction(resolve(s.run))}
+        self.places: dict[str, Place] = {**places, LOOP: InlinePlace(waiting, clock=clock, virtual=virtual)}
+        self.memory = Memory(self._memory_changed)
+        self.callee = Callee(name, boot, self._offers(waiting), directory=directory.hash)
+        self.callers: dict[str, Caller] = {}
+        self.sent: list[tuple[str, Sent]] = []
+        """Set points that left since the shell looked, with the action that published them (inline places only)."""
+        self._timers = Timers({t.name: t.period for t in directory.timers.values() if t.node == name})
+        self._now = 0.0
+        self._at: dict[str, str] = {}
+        self._asked: dict[str, str] = {}
+        self._commands: dict[str, _Commanded] = {}
+
+    def _offers(self, waiting: Mapping[str, ActionEntry]) -> dict[str, Offer]:
+        offers = {
+            a.name: Offer(device=a.device, orphan_time=a.orphan_time, deadline=a.deadline)
+            for a in self.directory.actions.values()
+            if a.node == self.name
+        }
+        for service in self.directory.services.values():
+            if service.node == self.name:
+                scope = "local" if service.local else "network"
+                offers.update(self._service_offers(service, scope, service.name in waiting))
+        return offers
+
+    def _service_offers(self, service: ServiceEntry, scope: str, waits: bool) -> dict[str, Offer]:
+        if service.name == MEMORY and not service.run:
+            return {call: Offer(scope, inline=self._memory_call) for call in MEMORY_CALLS}
+        if waits or not service.run:
+            return {service.name: Offer(scope)}
+        inline: Inline = inline_service(service, self._service_event)
+        return {service.name: Offer(scope, inline=inline)}
+
+    def caller(self, peer: str) -> Caller:
+        """The calling end for a peer, made when first wanted."""
+        if peer not in self.callers:
+            self.callers[peer] = Caller(peer, self.hello(), auto_ack=True)
+        return self.callers[peer]
+
+    def hello(self) -> Hello:
+        """How this node introduces itself to a peer."""
+        return Hello(OLDEST_VERSION, NEWEST_VERSION, "node", self.name, self.boot, 0, self.directory.hash)
+
+    def action_of(self, run: str) -> str:
+        """Action or service that a run or call under way belongs to; the node's name when it is unknown."""
+        return self.callee.running().get(run, self.name)
+
+    # --- time --------------------------------------------------------------------------------------------------------
+
+    def advance(self, now: float) -> None:
+        """Do all that is due: orders of callers, runs, devices, timers, and what comes of them."""
+        self._now = now
+        self.callee.advance(now)
+        for caller in self.callers.values():
+            caller.advance(now)
+        self._obey(now)
+        self._answer_runs(now)
+        for name in self._timers.advance(now):
+            self.callee.raise_event(now, name, source=name)
+        for key, place in self.places.items():
+            place.advance(now)
+            for report in place.reports():
+                self._take_report(now, key, report)
+        self._answer_runs(now)
+        self._answer_commands(now)
+
+    def due(self) -> float | None:
+        """When `advance` has something to do at the latest (s), None if only what comes in can matter."""
+        times = [self.callee.due(), self._timers.due(), *(c.due for c in self._commands.values())]
+        times += [caller.due() for caller in self.callers.values()]
+        times += [place.due() for place in self.places.values()]
+        return min((t for t in times if t is not None), default=None)
+
+    def close(self, now: float) -> None:
+        """Stop routines of all devices, and let them go."""
+        for place in self.places.values():
+            place.close(now)
+
+    # --- orders of callers -------------------------------------------------------------------------------------------
+
+    def _obey(self, now: float) -> None:
+        for order in self.callee.orders():
+            if isinstance(order, StartRun):
+                self._start(now, order.call)
+            elif isinstance(order, CancelRun):
+                cause = order.reason if order.reason in _OWN_CAUSES else "cancelled"
+                self.places[self._at[order.id]].take(now, Stop(order.id, cause, order.reason))
+            elif isinstance(order, Commanded):
+                self._command(now, order)
+
+    def _start(self, now: float, call: Call) -> None:
+        action = self.directory.actions.get(call.service)
+        key = LOOP if action is None else action.device or GENERAL
+        deadline = call.deadline if call.deadline is not None else action and action.deadline
+        self._at[call.id] = key
+        self.places[key].take(now, Begin(call.id, call.service, call.arguments, deadline, call.seed))
+
+    def _command(self, now: float, order: Commanded) -> None:
+        command = order.command
+        keys = [k for k in self.places if k != LOOP and command.target in ("", k or self.name)]
+        if command.verb not in ("hold", "release", "stop", "status"):
+            self.callee.answer(now, command.id, False, {"cause": "unknown_verb", "text": f"no verb {command.verb!r}"})
+        elif not keys and command.target:
+            text = f"{self.name} has no device {command.target!r}"
+            self.callee.answer(now, command.id, False, {"cause": "unknown_device", "text": text})
+        else:
+            self._commands[command.id] = _Commanded(command.verb, now + ANSWER_WITHIN, set(keys))
+            for key in keys:
+                self.places[key].command(now, command.id, command.verb)
+
+    def _answer_commands(self, now: float) -> None:
+        for id_, command in list(self._commands.items()):
+            if not command.missing or now >= command.due:
+                del self._commands[id_]
+                answers = {**command.answers, **{key or self.name: "no answer" for key in command.missing}}
+                held = command.verb != "hold" or all(a in _WELL_HELD for a in answers.values())
+                data = {"answers": answers, "devices": command.data}
+                self.callee.answer(now, id_, held and not command.missing, data)
+
+    # --- reports of places -------------------------------------------------------------------------------------------
+
+    def _take_report(self, now: float, key: str, report: Report) -> None:
+        if isinstance(report, Ended):
+            self._end(now, report)
+        elif isinstance(report, Asked):
+            self._ask(now, key, report)
+        elif isinstance(report, Sent):
+            self.sent.append((self.action_of(report.run), report))
+        elif isinstance(report, Raised):
+            self._raise(now, key, report)
+        elif isinstance(report, Told):
+            if report.id in self._commands:
+                command = self._commands[report.id]
+                command.missing.discard(key)
+                command.answers[key or self.name] = report.answer
+                command.data[key or self.name] = report.data
+        elif isinstance(report, Dropped):
+            for caller in self.callers.values():
+                caller.cancel(now, report.id, "its run no longer waits")
+        elif isinstance(report, Progressed) and report.id in self._at:
+            self.callee.feedback(now, report.id, report.fraction, report.data)
+
+    def _end(self, now: float, end: Ended) -> None:
+        if self._at.pop(end.id, None) is None:
+            return
+        for caller in self.callers.values():
+            caller.cancel_children(now, end.id, "its run is over")
+        executed = Executed(end.executed)
+        self.callee.finish(
+            now, end.id, end.status, end.values, end.cause, end.text, executed, end.seconds, end.cpu_seconds
+        )
+
+    def _raise(self, now: float, key: str, raised: Raised) -> None:
+        if not raised.run:
+            self.callee.raise_event(now, raised.name, raised.data, source=key or self.name, latched=True)
+        elif raised.run in self._at:
+            source = self.action_of(raised.run)
+            self.callee.raise_event(now, raised.name, raised.data, source=source, latched=True, run=raised.run)
+
+    def _ask(self, now: float, key: str, asked: Asked) -> None:
+        try:
+            peer = self.directory.where(asked.service)
+        except DirectoryError as fault:
+            self.places[key].take(now, Answered(asked.id, Status.ERROR, {}, "unknown_service", str(fault)))
+            return
+        self._asked[asked.id] = key
+        call = Call(asked.id, asked.service, asked.arguments, asked.deadline, parent=asked.run, seed=asked.seed)
+        self.caller(peer).call(now, call)
+
+    def _answer_runs(self, now: float) -> None:
+        """Hand the ends of calls to the runs that made them."""
+        for caller in self.callers.values():
+            for notice in caller.notices():
+                if isinstance(notice, CallEnded):
+                    end = notice.outcome
+                    key = self._asked.pop(end.id, None)
+                    if key is not None:
+                        self.places[key].take(now, Answered(end.id, end.status, end.values, end.cause, end.text))
+
+    # --- services of the node itself ---------------------------------------------------------------------------------
+
+    def _memory_call(self, now: float, call: Call) -> Outcome:
+        self._now = now
+        result = self.memory.call(call.service, call.arguments)
+        executed = Executed.NO if result.status is Status.ERROR else Executed.YES
+        return Outcome(call.id, result.status, result.values, result.cause, result.text, executed)
+
+    def _memory_changed(self, name: str, value: Any, version: int) -> None:
+        data = {"name": name, "value": value, "version": version}
+        self.callee.raise_event(self._now, event_name(name), data, source=MEMORY, latched=True)
+
+    def _service_event(self, service: str, name: str, data: Mapping[str, Any]) -> None:
+        self.callee.raise_event(self._now, name, data, source=service, latched=True)
+
+
+def _as_action(service: ServiceEntry) -> ActionEntry:
+    return ActionEntry(service.name, service.run, "", service.node)

@@ -1,0 +1,132 @@
+"""Where the runs of one device (or of none) take place; inline: the device's driver and its actions in the node itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+from services.comm.directory import ActionEntry
+from services.device import Driver
+from services.remote import CyclicDriver, DeviceCommand, DirectDevice, RemoteDriver
+from services.runner import DeviceControl, Runner
+from services.runs import Hold, Order, Report, Stop, Told
+
+SLACK = 1e-6  # s: binary fractions of a period must not cost a whole tick
+
+
+class Place(Protocol):
+    """Runs of one device, or of all actions that need none. Orders in, reports out, nothing blocks."""
+
+    def take(self, now: float, order: Order) -> None:
+        """Take an order about a run."""
+
+    def command(self, now: float, id: str, verb: str) -> None:  # noqa: A002
+        """Carry out an operator's `hold`, `release`, `stop` or `status`; a report `Told` with this id answers it."""
+
+    def advance(self, now: float) -> None:
+        """Do all that is due."""
+
+    def due(self) -> float | None:
+        """When `advance` has something to do at the latest (s)."""
+
+    def reports(self) -> list[Report]:
+        """What happened since the last call, in order."""
+
+    def close(self, now: float) -> None:
+        """Stop everything and let the device go."""
+
+
+class InlinePlace:
+    """A place in the node's own process: in lock step, and for services of the node's loop."""
+
+    def __init__(
+        self,
+        actions: Mapping[str, ActionEntry],
+        *,
+        clock: Callable[[], float],
+        driver: Driver | None = None,
+        streams: Mapping[str, float] | None = None,
+        substitutes: Mapping[str, Callable[..., Any]] | None = None,
+        virtual: bool = False,
+    ) -> None:
+        self._driver = driver
+        self._cyclic = CyclicDriver(driver) if driver is not None and driver.period else None
+        self._remote = RemoteDriver(self._post, clock)
+        self._commands: list[DeviceCommand] = []
+        self._next_step: float | None = None
+        self._told: list[Report] = []
+        self._runner = Runner(
+            actions,
+            clock=clock,
+            device=self._control(),
+            streams=streams,
+            substitutes=substitutes,
+            virtual=virtual,
+        )
+
+    def _control(self) -> DeviceControl | None:
+        if self._driver is None:
+            return None
+        return self._remote if self._cyclic else DirectDevice(self._driver)
+
+    def _post(self, command: DeviceCommand) -> None:
+        self._commands.append(command)
+
+    def take(self, now: float, order: Order) -> None:
+        """Take an order about a run."""
+        self._runner.take(now, order)
+
+    def command(self, now: float, id: str, verb: str) -> None:  # noqa: A002
+        """Carry out an operator's command at once."""
+        self._told.append(Told(id, *self._carry_out(now, verb)))
+
+    def _carry_out(self, now: float, verb: str) -> tuple[str, Mapping[str, Any]]:
+        driver = self._driver
+        if verb == "hold":
+            answer = driver.hold(now) if driver else "held"
+            if answer != "cannot hold":
+                self._runner.take(now, Hold(True))
+            return answer, {}
+        if verb == "release":
+            if driver:
+                driver.release(now)
+            self._runner.take(now, Hold(False))
+            return "released", {}
+        if verb == "stop":
+            for run in self._runner.runs:
+                self._runner.take(now, Stop(run, "stopped", "by command"))
+            if driver:
+                driver.stop(now)
+            return "stopped" if driver is None or driver.stopped() else "stopping", {}
+        state = dict(driver.state()) if driver else {}
+        return "up", {"runs": list(self._runner.runs), "fenced": self._runner.fenced, "state": state}
+
+    def advance(self, now: float) -> None:
+        """Runs first, then as many cycles of the driver as are due."""
+        self._runner.advance(now)
+        if self._cyclic is None or self._driver is None or not self._driver.period:
+            return
+        due = now if self._next_step is None else self._next_step
+        while due <= now + SLACK:
+            commands, self._commands = self._commands, []
+            for command in commands:
+                self._cyclic.take(now, command)
+            self._remote.take(self._cyclic.step(now))
+            due += self._driver.period
+        self._next_step = due
+
+    def due(self) -> float | None:
+        """When `advance` has something to do at the latest (s)."""
+        times = (self._runner.due(), self._next_step)
+        return min((t for t in times if t is not None), default=None)
+
+    def reports(self) -> list[Report]:
+        """What happened since the last call, in order."""
+        told, self._told = self._told, []
+        return [*self._runner.reports(), *told]
+
+    def close(self, now: float) -> None:
+        """Stop routine, then let the device go."""
+        if self._driver is not None:
+            self._driver.stop(now)
+            self._driver.close()

@@ -1,0 +1,151 @@
+"""Actions and services of the toy cell: good ones, slow ones, and ones that hang, crash or eat memory."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+
+from services.action import Cancelled, Context, Result, error, failure, success
+
+
+def add(ctx: Context, *, a: int, b: int = 1) -> Result:
+    """The sum."""
+    return success(sum=a + b)
+
+
+async def nap(ctx: Context, *, seconds: float) -> Result:
+    """Wait."""
+    await ctx.sleep(seconds)
+    return success(slept=seconds)
+
+
+async def go(ctx: Context, *, to: float, timeout: float = 5.0) -> Result:
+    """Send the slide somewhere and wait until it is there."""
+    number = ctx.device.send({"to": to})
+    await ctx.wait(lambda: ctx.device.handled >= number, 1.0)
+    if ctx.device.refused:
+        return error("refused", ctx.device.refused)
+    try:
+        there = await ctx.wait(lambda: abs(ctx.device.state["position"] - to) < 1e-6, timeout)
+    except Cancelled:
+        ctx.device.send({"halt": True})
+        raise
+    return success(position=ctx.device.state["position"]) if there else failure("slow")
+
+
+async def follow(ctx: Context, *, seconds: float) -> Result:
+    """Let the slide follow the stream for a while."""
+    ctx.device.send({"follow": True})
+    await ctx.sleep(seconds)
+    ctx.device.send({"halt": True})
+    return success(position=ctx.device.state["position"], count=ctx.device.state["count"])
+
+
+async def lead(ctx: Context, *, seconds: float, speed: float = 0.5) -> Result:
+    """Publish set points on the way, one every 8 ms."""
+    begun = ctx.now
+    while ctx.now < begun + seconds:
+        ctx.publish("points", [speed * (ctx.now - begun)])
+        await ctx.sleep(0.008)
+    ctx.raise_event("led", seconds=seconds)
+    return success()
+
+
+async def look(ctx: Context, *, images: int) -> Result:
+    """Take so many images; gives their sequence numbers, ages and sums."""
+    source = ctx.device.images
+    source.start(50.0)
+    seen: list[list[float]] = []
+    while len(seen) < images:
+        taken: list[object] = []
+
+        def ready() -> bool:
+            image = source.newest()
+            if image is not None:
+                seen.append([image.sequence, ctx.now - image.time, int(image.pixels.sum())])
+            return image is not None
+
+        if not await ctx.wait(ready, 1.0):
+            return error("no_image")
+        taken.clear()
+    source.stop()
+    return success(seen=seen)
+
+
+async def relay(ctx: Context, *, a: int) -> Result:
+    """Call another action's node, and the memory, by name alone."""
+    result = await ctx.call("sum_service", a=a, b=2)
+    version = await ctx.put("sum", result.values.get("sum"))
+    return success(sum=await ctx.get("sum"), version=version, pid=os.getpid())
+
+
+async def delegate(ctx: Context, *, service: str) -> Result:
+    """Hand back what a service answered."""
+    result = await ctx.call(service, 1.0)
+    return success(status=str(result.status), cause=result.cause, text=result.text)
+
+
+async def swap(ctx: Context, *, times: int) -> Result:
+    """Count up a shared variable, so many times, against whoever else does."""
+    for _ in range(times):
+        while True:
+            seen = await ctx.call("memory.get", name="count")
+            value, version = seen.values["value"] or 0, seen.values["version"]
+            if await ctx.compare_and_set("count", version, value + 1):
+                break
+    return success()
+
+
+def secret(ctx: Context) -> Result:
+    """A service for callers of the same host."""
+    return success(secret=42)
+
+
+async def slow_service(ctx: Context, *, seconds: float) -> Result:
+    """A service that waits."""
+    await ctx.sleep(seconds)
+    return success()
+
+
+def hang(ctx: Context) -> Result:
+    """Never come back, and never give the interpreter a chance to ask why."""
+    while True:
+        pass
+
+
+async def hang_moving(ctx: Context) -> Result:
+    """Send the slide far away, then hang."""
+    ctx.device.send({"to": 90.0})
+    await ctx.sleep(0.1)
+    while True:
+        pass
+
+
+def segfault(ctx: Context) -> Result:
+    """Read what is not there."""
+    ctypes.string_at(8)
+    return success()
+
+
+def leave(ctx: Context) -> Result:
+    """End the whole process."""
+    os._exit(7)
+
+
+def eat(ctx: Context, *, megabytes: int) -> Result:
+    """Take much memory."""
+    block = bytearray(megabytes << 20)
+    return success(bytes=len(block))
+
+
+def pid(ctx: Context) -> Result:
+    """Which process runs this."""
+    return success(pid=os.getpid())
+
+
+async def tell(ctx: Context, *, name: str) -> Result:
+    """Raise an event, tell progress, wait a bit."""
+    ctx.raise_event(name, run=ctx.run)
+    ctx.progress(0.5, note="half")
+    await ctx.sleep(0.1)
+    return success(draw=float(ctx.random("x").random()))

@@ -1,0 +1,431 @@
+"""Nodes in a lock-step cell: calls, devices, streams, memory and timers; and that placement shows nowhere."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from services.comm.canbus import Frame
+from services.comm.caller import Accepted, Answered, Caller, Ended, EventArrived, Notice, Progress
+from services.comm.cell import Cell, Delays
+from services.comm.channels import can_body, image_body, read_can, read_images_wanted
+from services.comm.directory import Directory, DirectoryError, parse
+from services.comm.messages import Call, Command, Hello
+from services.comm.party import TICK, Envelope
+from services.lockstep_node import LockstepNode
+
+CELL = """\
+schema = 1
+[nodes.left]
+host = "127.0.0.1"
+port = 7401
+[nodes.right]
+host = "127.0.0.1"
+port = 7402
+[nodes.world]
+host = "127.0.0.1"
+port = 7400
+sim = true
+[devices.slide]
+node = "left"
+driver = "toy_cell.drivers:Slide"
+period = 0.004
+bus = true
+[devices.eye]
+node = "right"
+driver = "toy_cell.drivers:Eye"
+source = "sim"
+[streams.points]
+to = "slide"
+period = 0.02
+[timers.beat]
+node = "right"
+period = 0.04
+[services.memory]
+node = "right"
+[services.sum_service]
+node = "right"
+run = "toy_cell.actions:add"
+[services.slow_service]
+node = "right"
+run = "toy_cell.actions:slow_service"
+[services.secret]
+node = "right"
+run = "toy_cell.actions:secret"
+scope = "local"
+[actions]
+go = { run = "toy_cell.actions:go", task = "move", device = "slide" }
+follow = { run = "toy_cell.actions:follow", task = "move", device = "slide" }
+look = { run = "toy_cell.actions:look", task = "see", device = "eye" }
+lead = { run = "toy_cell.actions:lead", task = "see", device = "eye" }
+add = { run = "toy_cell.actions:add", task = "sum", node = "NODE", compute_time = 0.1 }
+nap = { run = "toy_cell.actions:nap", task = "sum", node = "NODE", deadline = 1.0, orphan_time = 0.2 }
+relay = { run = "toy_cell.actions:relay", task = "sum", node = "NODE" }
+swap = { run = "toy_cell.actions:swap", task = "sum", node = "NODE" }
+delegate = { run = "toy_cell.actions:delegate", task = "sum", node = "NODE" }
+tell = { run = "toy_cell.actions:tell", task = "sum", node = "NODE" }
+"""
+
+
+def directory(node: str = "left", **replaced: str) -> Directory:
+    text = CELL.replace("NODE", node)
+    for old, new in replaced.items():
+        assert old in text
+        text = text.replace(old, new)
+    return parse(text, Path("services.toml"))
+
+
+class World:
+    """The laboratory: answers each frame with one, sends an image every 20 ms while images are wanted."""
+
+    name = "world"
+
+    def __init__(self, places: Directory) -> None:
+        self.places = places
+        self.frames: list[Frame] = []
+        self.out: list[Envelope] = []
+        self.rate, self.wish, self.sequence, self.next = 0.0, 0, 0, 0.0
+
+    def receive(self, now: float, envelope: Envelope) -> None:
+        if envelope.channel == "can":
+            frames = read_can(envelope.body)
+            self.frames += frames
+            answer = can_body(Frame(frame.id + 1, frame.data) for frame in frames)
+            self.send(envelope.source, "can", answer)
+        elif envelope.channel == "control":
+            wanted = read_images_wanted(envelope.body)
+            assert wanted is not None
+            (self.rate, self.wish), self.next = wanted, now
+
+    def advance(self, now: float) -> None:
+        if self.rate and now >= self.next - 1e-9:
+            self.next = now + 1 / self.rate
+            pixels = np.full((3, 4), self.sequence, np.uint8)
+            self.send("eye", "image", image_body(pixels, 0.003, self.sequence, self.wish))
+            self.sequence += 1
+
+    def drain(self) -> Sequence[Envelope]:
+        out, self.out = self.out, []
+        return out
+
+    def send(self, device: str, channel: str, body: Any) -> None:
+        self.out.append(Envelope(self.places.where(device), "world", device, channel, body))
+
+
+class Coordinator:
+    """Calls by script: (tick, service, arguments), and writes down what it hears, with the tick."""
+
+    name = "coordinator"
+
+    def __init__(self, places: Directory, script: Sequence[tuple[int, str, dict[str, Any]]] = ()) -> None:
+        self.places = places
+        self.script = list(script)
+        self.heard: list[tuple[int, Notice]] = []
+        self.tick = 0
+        self.made = 0
+        hello = Hello(1, 1, "coordinator", self.name, "boot", 1, places.hash)
+        self.callers = {n: Caller(n, hello, auto_ack=True) for n in places.nodes if not places.nodes[n].sim}
+        for caller in self.callers.values():
+            caller.open(0.0)
+
+    def call(self, service: str, deadline: float | None = None, /, **arguments: Any) -> str:
+        self.made += 1
+        call = Call(f"c{self.made}", service, arguments, deadline, seed=5)
+        self.callers[self.places.where(service)].call(self.tick * TICK, call)
+        return call.id
+
+    def receive(self, now: float, envelope: Envelope) -> None:
+        self.callers[self.places.party(envelope.source)].receive(now, envelope.body)
+
+    def advance(self, now: float) -> None:
+        self.tick = round(now / TICK)
+        while self.script and self.script[0][0] <= self.tick:
+            _, service, arguments = self.script.pop(0)
+            self.call(service, **arguments)
+        for caller in self.callers.values():
+            caller.advance(now)
+            self.heard += [(self.tick, notice) for notice in caller.notices()]
+
+    def drain(self) -> Sequence[Envelope]:
+        now = self.tick * TICK
+        return [
+            Envelope(peer, self.name, getattr(message, "service", peer), "call", message)
+            for peer, caller in self.callers.items()
+            for message in caller.messages(now)
+        ]
+
+    def ended(self, identity: str) -> Any:
+        (end,) = [n.outcome for _, n in self.heard if isinstance(n, Ended) and n.outcome.id == identity]
+        return end
+
+
+class Bench:
+    """A whole cell."""
+
+    def __init__(self, places: Directory, script: Sequence[tuple[int, str, dict[str, Any]]] = (), **mock: Any) -> None:
+        self.world = World(places)
+        self.coordinator = Coordinator(places, script)
+        nodes = [n for n in places.nodes.values() if not n.sim]
+        self.nodes = {n.name: LockstepNode(places, n.name, substitutes=mock) for n in nodes}
+        self.cell = Cell([self.coordinator, self.world, *self.nodes.values()], Delays(places.delays()))
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds / TICK)):
+            self.cell.step()
+
+    def call(self, service: str, span: float = 1.0, deadline: float | None = None, /, **arguments: Any) -> Any:
+        identity = self.coordinator.call(service, deadline, **arguments)
+        self.run(span)
+        return self.coordinator.ended(identity)
+
+
+def test_an_action_on_a_cyclic_device() -> None:
+    bench = Bench(directory())
+    end = bench.call("go", 1.0, to=0.2)
+    assert (end.status, end.values) == ("success", {"position": pytest.approx(0.2)})
+    assert end.seconds == pytest.approx(0.2, abs=6 * TICK)
+    assert bench.call("go", to=1e6).text == "1000000.0 is beyond the rail; stay within 100 m"
+    assert [f.id for f in bench.world.frames[:3]] == [0x181] * 3 and len(bench.world.frames) >= 490
+
+
+def test_images_come_from_the_laboratory_with_their_age() -> None:
+    bench = Bench(directory())
+    end = bench.call("look", images=3)
+    assert [row[0] for row in end.values["seen"]] == [0, 1, 2]
+    assert [row[1] for row in end.values["seen"]] == pytest.approx([0.003] * 3)
+    assert [row[2] for row in end.values["seen"]] == [0, 12, 24]
+    assert bench.world.rate == 0.0
+    assert bench.call("look", images=1).values["seen"][0][0] == 3, "an image of the earlier start came through"
+
+
+def test_set_points_go_from_one_device_to_another() -> None:
+    bench = Bench(directory(), [(5, "lead", {"seconds": 0.6}), (5, "follow", {"seconds": 1.0})])
+    bench.run(1.5)
+    end = bench.coordinator.ended("c2")
+    assert end.values["count"] == 31 and 0.27 < end.values["position"] < 0.3
+    assert bench.coordinator.ended("c1").status == "success"
+    (event,) = [n.event for _, n in bench.coordinator.heard if isinstance(n, EventArrived)]
+    assert (event.name, event.source, event.run, event.data) == ("led", "lead", "c1", {"seconds": 0.6})
+
+
+def test_services_memory_and_child_calls() -> None:
+    bench = Bench(directory())
+    end = bench.call("relay", a=4)
+    assert (end.values["sum"], end.values["version"]) == (6, 1)
+    assert bench.call("slow_service", 1.0, seconds=0.2).seconds == pytest.approx(0.2, abs=TICK)
+    assert bench.call("sum_service", a="x").cause == "exception"
+    assert bench.call("sum_service", c=1).text == "sum_service: takes no argument 'c'; it takes: a, b"
+
+
+def test_compare_and_set_loses_no_update() -> None:
+    script = [(5, "swap", {"times": 7}), (5, "swap", {"times": 5})]
+    bench = Bench(directory(), script)
+    bench.run(3.0)
+    assert bench.coordinator.ended("c1").status == bench.coordinator.ended("c2").status == "success"
+    assert bench.nodes["right"].node.memory.values()["count"].value == 12
+
+
+def test_watched_variables_are_told() -> None:
+    bench = Bench(directory())
+    bench.coordinator.callers["right"].subscribe(0.0, ["memory:sum"])
+    bench.call("relay", a=4)
+    events = [n.event for _, n in bench.coordinator.heard if isinstance(n, EventArrived)]
+    assert [(e.name, e.data) for e in events] == [("memory:sum", {"name": "sum", "value": 6, "version": 1})]
+    assert events[0].number == 1
+
+
+def test_timers_pulse_for_those_who_listen() -> None:
+    bench = Bench(directory())
+    bench.run(0.5)
+    assert not [n for _, n in bench.coordinator.heard if isinstance(n, EventArrived)]
+    bench.coordinator.callers["right"].subscribe(0.5, ["beat"])
+    bench.run(0.5)
+    ticks = [t for t, n in bench.coordinator.heard if isinstance(n, EventArrived)]
+    assert 11 <= len(ticks) <= 13 and set(np.diff(ticks)) == {10}
+    numbers = {n.event.number for _, n in bench.coordinator.heard if isinstance(n, EventArrived)}
+    assert numbers == {0}, "a pulse needs no acknowledgement"
+
+
+@pytest.mark.parametrize(
+    ("service", "arguments", "deadline", "cause", "executed"),
+    [
+        ("nap", {"seconds": 9.0}, None, "deadline", "yes"),
+        ("nap", {"seconds": 9.0}, 0.3, "deadline", "yes"),
+        ("nap", {"minutes": 9.0}, None, "bad_arguments", "no"),
+        ("delegate", {"service": "nothing"}, None, "", "yes"),
+    ],
+)
+def test_limits(service: str, arguments: dict[str, Any], deadline: float | None, cause: str, executed: str) -> None:
+    end = Bench(directory()).call(service, 2.0, deadline, **arguments)
+    assert (end.cause, end.executed) == (cause, executed)
+
+
+@pytest.mark.parametrize(
+    ("service", "cause"),
+    [
+        ("nothing", "unknown_service"),
+        ("go", "device_needs_coordinator"),
+        ("secret", ""),
+        ("sum_service", "bad_arguments"),
+    ],
+)
+def test_what_a_node_may_call(service: str, cause: str) -> None:
+    assert Bench(directory()).call("delegate", service=service).values["cause"] == cause
+
+
+def test_a_local_service_is_refused_to_another_host() -> None:
+    far = directory(**{'host = "127.0.0.1"\nport = 7401': 'host = "10.0.0.9"\nport = 7401'})
+    end = Bench(far).call("delegate", service="secret")
+    assert end.values["cause"] == "local_only" and "serves callers on the host of right alone" in end.values["text"]
+
+
+def test_one_run_a_device_and_cancel() -> None:
+    bench = Bench(directory())
+    first = bench.coordinator.call("go", to=50.0)
+    bench.run(0.1)
+    assert bench.call("go", 0.1, to=0.0).cause == "busy"
+    bench.coordinator.callers["left"].cancel(bench.cell.now, first, "enough")
+    bench.run(0.2)
+    end = bench.coordinator.ended(first)
+    assert (end.status, end.cause, end.executed) == ("error", "cancelled", "yes")
+    assert bench.call("go", 1.0, to=0.1).status == "success"
+
+
+def test_feedback_and_events_reach_the_caller() -> None:
+    bench = Bench(directory())
+    end = bench.call("tell", name="hello")
+    kinds = [type(n) for _, n in bench.coordinator.heard if not isinstance(n, Ended)]
+    assert kinds.count(Accepted) == 1 and kinds.count(Progress) == 1 and kinds.count(EventArrived) == 1
+    assert end.values["draw"] == Bench(directory("right")).call("tell", name="x").values["draw"]
+
+
+def test_hold_stops_the_arm_and_its_run_but_not_the_eye() -> None:
+    bench = Bench(directory())
+    first = bench.coordinator.call("go", to=0.5)
+    bench.run(0.2)
+    for peer, caller in bench.coordinator.callers.items():
+        caller.command(bench.cell.now, Command(f"hold {peer}", "hold"))
+    bench.run(3.0)
+    answers = {n.answer.id: n.answer for _, n in bench.coordinator.heard if isinstance(n, Answered)}
+    assert answers["hold left"].ok and answers["hold left"].data["answers"] == {"slide": "held", "left": "held"}
+    assert not answers["hold right"].ok and answers["hold right"].data["answers"]["eye"] == "cannot hold"
+    bench.coordinator.callers["left"].command(bench.cell.now, Command("s", "status", "slide"))
+    bench.run(0.1)
+    status = next(n.answer for _, n in bench.coordinator.heard if isinstance(n, Answered) and n.answer.id == "s")
+    assert status.data["devices"]["slide"]["runs"] == [first]
+    assert 0.15 < status.data["devices"]["slide"]["state"]["position"] < 0.25
+    bench.coordinator.callers["left"].command(bench.cell.now, Command("r", "release"))
+    bench.run(1.0)
+    end = bench.coordinator.ended(first)
+    assert end.status == "success" and end.seconds == pytest.approx(0.5, abs=0.05), "the pause counts"
+
+
+@pytest.mark.parametrize(
+    ("verb", "target", "cause"), [("dance", "", "unknown_verb"), ("hold", "foot", "unknown_device")]
+)
+def test_commands_that_mean_nothing(verb: str, target: str, cause: str) -> None:
+    bench = Bench(directory())
+    bench.run(0.05)
+    bench.coordinator.callers["left"].command(bench.cell.now, Command("x", verb, target))
+    bench.run(0.05)
+    (answer,) = [n.answer for _, n in bench.coordinator.heard if isinstance(n, Answered)]
+    assert not answer.ok and answer.data["cause"] == cause
+
+
+def test_stop_stops_device_and_runs() -> None:
+    bench = Bench(directory())
+    first = bench.coordinator.call("go", to=50.0)
+    bench.run(0.1)
+    bench.coordinator.callers["left"].command(bench.cell.now, Command("x", "stop"))
+    bench.run(0.2)
+    assert bench.coordinator.ended(first).cause in ("stopped", "cancelled")
+    position = bench.call("go", to=0.0).values["position"]
+    assert position == 0.0
+
+
+def test_an_orphan_is_stopped() -> None:
+    bench = Bench(directory())
+    first = bench.coordinator.call("nap", seconds=0.9)
+    bench.run(0.1)
+    bench.nodes["left"].node.callee.link_down(bench.cell.now, "coordinator")
+    bench.run(0.4)
+    assert bench.nodes["left"].node.callee.running() == {} and first
+
+
+def test_a_driver_that_refuses_its_keys_is_one_fault() -> None:
+    with pytest.raises(DirectoryError, match=r"devices.slide: toy_cell.drivers:Slide refuses it: is missing 'period'"):
+        LockstepNode(directory(**{"period = 0.004\n": ""}), "left")
+    with pytest.raises(DirectoryError, match="no stream 'points' leads here"):
+        LockstepNode(directory(**{'to = "slide"': 'to = "eye"'}), "left")
+    with pytest.raises(DirectoryError, match="collections:ChainMap is no driver: it has no period, state"):
+        LockstepNode(directory(**{"toy_cell.drivers:Slide": "collections:ChainMap"}), "left")
+
+
+# --- placement -------------------------------------------------------------------------------------------------------
+
+CALLS: list[tuple[str, dict[str, Any]]] = [
+    ("add", {"a": 1}),
+    ("nap", {"seconds": 0.05}),
+    ("relay", {"a": 2}),
+    ("swap", {"times": 2}),
+    ("go", {"to": 0.1}),
+    ("look", {"images": 2}),
+    ("lead", {"seconds": 0.1}),
+    ("follow", {"seconds": 0.1}),
+    ("sum_service", {"a": 3}),
+    ("delegate", {"service": "slow_service"}),
+    ("tell", {"name": "n"}),
+]
+
+
+def trace(places: Directory, script: Sequence[tuple[int, str, dict[str, Any]]]) -> list[tuple[Any, ...]]:
+    bench = Bench(places, script)
+    for caller in bench.coordinator.callers.values():
+        caller.subscribe(0.0, ["beat", "memory:sum", "memory:count"])
+    bench.run(1.0)
+    rows: list[tuple[Any, ...]] = []
+    for tick, notice in bench.coordinator.heard:
+        if isinstance(notice, Ended):
+            o = notice.outcome
+            values = {k: v for k, v in o.values.items() if k != "pid"}
+            rows.append((tick, o.id, o.status, repr(values), o.cause, o.executed, round(o.seconds, 9)))
+        elif isinstance(notice, EventArrived):
+            rows.append((tick, notice.event.source, notice.event.name, notice.event.number, repr(notice.event.data)))
+        elif isinstance(notice, Accepted | Progress):
+            rows.append((tick, notice.id, type(notice).__name__))
+    return sorted(rows, key=repr)
+
+
+@settings(max_examples=8, deadline=None)
+@given(
+    calls=st.lists(st.tuples(st.integers(0, 60), st.sampled_from(CALLS)), min_size=2, max_size=8),
+    everything_left=st.booleans(),
+)
+def test_placement_shows_nowhere(calls: list[tuple[int, tuple[str, dict[str, Any]]]], everything_left: bool) -> None:
+    script = sorted(((tick, *call) for tick, call in calls), key=lambda row: row[0])
+    here = trace(directory("left"), script)
+    there = directory("left", **{'node = "right"': 'node = "left"'}) if everything_left else directory("right")
+    assert here == trace(there, script)
+
+
+def test_the_same_run_twice() -> None:
+    script = [(10 * n, service, arguments) for n, (service, arguments) in enumerate(CALLS)]
+    first = trace(directory(), script)
+    assert len([row for row in first if len(row) == 7]) == len(CALLS)
+    assert first == trace(directory(), script)
+
+
+def test_link_delays_hold_for_their_channel() -> None:
+    slow = parse(CELL.replace("NODE", "left") + "[links]\nimage = 0.2\n", Path("services.toml"))
+    seen = Bench(slow).call("look", 2.0, images=2).values["seen"]
+    assert [row[0] for row in seen] == [0, 1]
+    quick = Bench(directory())
+    quick.call("look", images=2)
+    assert list(itertools.chain(seen[0][1:])) == pytest.approx([0.003, 0])
