@@ -69,6 +69,7 @@ class Supervisor:
         logs.mkdir(parents=True, exist_ok=True)
         self._children = [_Child(program, logs / f"{program.name}.log") for program in programs]
         self._respawn = respawn
+        self._wait_ready = wait_ready
         self._notice = notice or (lambda _: None)
         self._stopping = False
 
@@ -86,10 +87,10 @@ class Supervisor:
         await self.stop()
 
     async def start(self, timeout: float = 30.0) -> None:
-        """Start all programs and wait until each is ready."""
+        """Start all programs and wait until each is ready (unless told not to: lock-step nodes wait for the coordinator)."""
         for child in self._children:
             child.task = asyncio.create_task(self._keep(child), name=f"keep {child.program.name}")
-        for child in self._children:
+        for child in self._children if self._wait_ready else ():
             await self._until_ready(child, timeout)
 
     async def stop(self) -> None:

@@ -1,0 +1,86 @@
+"""What a run shows in the terminal: which runs go on, how many are done, and the result as tables."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+if TYPE_CHECKING:
+    from coordinator.mission import Mission
+
+COLOURS = {"success": "green", "failure": "yellow", "error": "red"}
+REFRESH = 0.1
+LONGEST_TABLE = 24
+
+
+@contextmanager
+def live_progress() -> Iterator[Callable[[Mission, float], None]]:
+    """A line that follows the mission run; calls more often than every 0.1 s of wall time cost next to nothing."""
+    shown = 0.0
+    with Live(Text("connecting"), console=Console(stderr=True), auto_refresh=False, transient=True) as live:
+
+        def watch(mission: Mission, now: float) -> None:
+            nonlocal shown
+            wall = time.monotonic()
+            if wall - shown >= REFRESH:
+                shown = wall
+                live.update(_line(mission, now), refresh=True)
+
+        yield watch
+
+
+def _line(mission: Mission, now: float) -> Text:
+    tally = mission.tally
+    text = Text()
+    text.append(f"{now - mission.begun:7.1f} s  " if mission.begun else "", style="dim")
+    done = sum(cycle.ended is not None for cycle in tally.cycles)
+    text.append(f"run {len(tally.cycles)} of {mission.runs}  ", style="bold")
+    for cycle in tally.cycles[max(0, done - 20) : done]:
+        text.append("\u25cf", style=COLOURS[cycle.status.value])
+    going = sorted({run.place for run in mission.executor.state.runs()})
+    text.append("  " + (" + ".join(going) if going else mission.stage.value))
+    if mission.lost:
+        text.append(f"  away: {', '.join(mission.lost)}", style="red")
+    return text
+
+
+def print_result(result: Mapping[str, Any]) -> None:
+    """The result: lists of tables as tables, everything else in one line each."""
+    console = Console()
+    for key, value in result.items():
+        if isinstance(value, list) and value and all(isinstance(row, Mapping) for row in value):
+            console.print(_table(key, value))
+    plain = Table.grid(padding=(0, 2))
+    for key, value in result.items():
+        if isinstance(value, bool | int | float | str):
+            plain.add_row(Text(key, style="dim"), _cell(key, value))
+    console.print(plain)
+
+
+def _table(title: str, rows: list[Mapping[str, Any]]) -> Table:
+    left_out = max(0, len(rows) - LONGEST_TABLE)
+    table = Table(title=title, title_justify="left", caption=f"{left_out} more in --json" if left_out else None)
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    for column in columns:
+        numeric = all(isinstance(row.get(column), int | float | None) for row in rows)
+        table.add_column(column, justify="right" if numeric else "left")
+    for row in rows[:LONGEST_TABLE]:
+        table.add_row(*(_cell(column, row.get(column)) for column in columns))
+    return table
+
+
+def _cell(key: str, value: Any) -> Text:
+    if value is None:
+        return Text("-", style="dim")
+    if isinstance(value, bool):
+        return Text("yes" if value else "no")
+    if isinstance(value, float):
+        return Text(f"{value:.4g}")
+    return Text(str(value), style=COLOURS.get(str(value), "") if key == "status" else "")

@@ -1,0 +1,274 @@
+"""Run a task: in real time over the nodes of services.toml, or in lock step, where simulated time is exact."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractAsyncContextManager, contextmanager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from coordinator.cli import CommandError
+from coordinator.cli.loading import add_services_argument, load_directory, load_task, write_json
+
+if TYPE_CHECKING:
+    from coordinator.launch import Setting
+    from coordinator.mission import Mission
+    from coordinator.task import Task
+    from coordinator.timeline import Timeline
+    from services.comm.directory import Directory
+
+EXAMPLE = "petrobot run catch_ball --mode lockstep --runs 20 --seed 1 --json out.json"
+LONGEST_LOCKSTEP = 1e9
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument("task", help="a task file, or the name of a task that comes with petrobot")
+    parser.add_argument(
+        "--runs", type=_positive, metavar="N", help="how many runs (default: tokens in the task's runs place)"
+    )
+    parser.add_argument("--mode", choices=("realtime", "lockstep"), default="realtime", help="default: %(default)s")
+    parser.add_argument(
+        "--seed", type=int, default=1, metavar="S", help="of all chance in the run (default: %(default)s)"
+    )
+    parser.add_argument("--regime", metavar="NAME", help="the same as --set regime=NAME")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the task")
+    parser.add_argument(
+        "--use", action="append", default=[], metavar="TASK=ACTION", help="the action for a primitive task"
+    )
+    parser.add_argument(
+        "--processes", type=int, choices=(1, 0), default=1, help="lock step: 1 for one process, 0 for one a node"
+    )
+    parser.add_argument(
+        "--up", action="store_true", help="launch the nodes of this host for this run, and end them after it"
+    )
+    parser.add_argument("--mock", metavar="FILE", type=Path, help="replace actions by scripted ones")
+    parser.add_argument("--json", metavar="FILE", help="write the result as JSON (- for standard output)")
+    parser.add_argument("--report", metavar="FOLDER", type=Path, help="leave a report in this folder")
+    parser.add_argument("--quiet", action="store_true", help="no progress in the terminal")
+    add_services_argument(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Check the task, run it, print and write the result."""
+    from coordinator.mission import MissionError
+
+    directory, task = load_directory(options.services), load_task(options.task)
+    _refuse_unfit(task, directory)
+    setting = _setting(task, directory, options)
+    begun = time.perf_counter()
+    try:
+        if options.mode == "lockstep":
+            mission, timeline = _run_lockstep(directory, setting, options)
+        else:
+            mission, timeline = asyncio.run(_run_realtime(directory, setting, options))
+    except MissionError as fault:
+        raise CommandError(1, str(fault)) from fault
+    result = mission.result(options.mode, time.perf_counter() - begun)
+    _give(result, task, timeline, options)
+    return 0 if result["status"] == "success" else 1
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not at least 1")
+    return value
+
+
+def _refuse_unfit(task: Task, directory: Directory) -> None:
+    from coordinator.check import check
+
+    report = check(task, {action: entry.node for action, entry in directory.actions.items()})
+    faults = [f for f in report.findings if f.severity == "error"]
+    if faults:
+        lines = "\n".join(f"  {f.key}: {f.text}\n    {f.remedy}" for f in faults)
+        raise CommandError(2, f"{task.name} may not run:\n{lines}")
+
+
+def _setting(task: Task, directory: Directory, options: argparse.Namespace) -> Setting:
+    from coordinator.executor import FirstAlternative
+    from coordinator.launch import Setting
+
+    given = dict(_pairs("--set", options.set))
+    if options.regime is not None:
+        given["regime"] = options.regime
+    parameters = {name: _parameter(task, name, text) for name, text in given.items()}
+    chosen = dict(_pairs("--use", options.use))
+    for primitive, action in chosen.items():
+        known = task.primitive_tasks.get(primitive)
+        if known is None or action not in known.alternatives:
+            choices = ", ".join(known.alternatives) if known else ", ".join(task.primitive_tasks)
+            raise CommandError(2, f"--use {primitive}={action}: not known to {task.name}; choose among {choices}")
+        if action not in directory.actions:
+            raise CommandError(2, f"--use {primitive}={action}: {directory.source} places no action {action}")
+    return Setting(task, parameters, options.runs, options.seed, FirstAlternative(chosen))
+
+
+def _pairs(option: str, texts: list[str]) -> Iterator[tuple[str, str]]:
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise CommandError(2, f"{option} {text}: write NAME=VALUE")
+        yield name, value
+
+
+def _parameter(task: Task, name: str, text: str) -> Any:
+    if name not in task.parameters:
+        known = ", ".join(task.parameters) or "none"
+        raise CommandError(2, f"{task.name} has no parameter {name!r}; it has: {known}")
+    default = task.parameters[name]
+    if isinstance(default, bool):
+        if text not in ("true", "false"):
+            raise CommandError(2, f"parameter {name}: {text!r} is neither true nor false")
+        return text == "true"
+    try:
+        return type(default)(text) if isinstance(default, int | float) else text
+    except ValueError as fault:
+        raise CommandError(2, f"parameter {name}: {text!r} is no {type(default).__name__}") from fault
+
+
+def _substitutes(options: argparse.Namespace, directory: Directory) -> Mapping[str, Callable[..., Any]] | None:
+    if options.mock is None:
+        return None
+    from coordinator.launch import SCRIPTED, load_object
+
+    try:
+        scripted: Mapping[str, Callable[..., Any]] = load_object(SCRIPTED)(options.mock)
+    except OSError as fault:
+        raise CommandError(2, f"{options.mock}: {fault.strerror}") from fault
+    except Exception as fault:
+        raise CommandError(2, str(fault)) from fault
+    for name in scripted:
+        if name not in directory.actions:
+            raise CommandError(2, f"{options.mock}: actions.{name}: {directory.source} has no such action")
+    return scripted
+
+
+# --- lock step ---------------------------------------------------------------------------------------------------------
+
+
+def _run_lockstep(directory: Directory, setting: Setting, options: argparse.Namespace) -> tuple[Mission, Timeline]:
+    from coordinator.launch import lockstep_cell
+    from coordinator.timeline import Timeline
+    from services.comm.cell import CellError
+
+    timeline = Timeline()
+    with _progress(options) as watch:
+        try:
+            if options.processes == 1:
+                cell, party = lockstep_cell(directory, setting, _substitutes(options, directory), watch)
+                party.mission.executor.observers.append(timeline)
+                cell.run(lambda: party.over, int(LONGEST_LOCKSTEP))
+            else:
+                party = asyncio.run(_spread_lockstep(directory, setting, options, timeline, watch))
+        except CellError as fault:
+            raise CommandError(3, str(fault)) from fault
+    return party.mission, timeline
+
+
+async def _spread_lockstep(
+    directory: Directory,
+    setting: Setting,
+    options: argparse.Namespace,
+    timeline: Timeline,
+    watch: Callable[[Mission, float], None] | None,
+) -> Any:
+    from coordinator.launch import lockstep_member, local_programs
+    from coordinator.supervisor import Supervisor
+
+    if options.mock is not None:
+        raise CommandError(2, "--mock in lock step needs --processes 1: scripted actions live in this process")
+    spread, member, party = lockstep_member(directory, setting, watch)
+    party.mission.executor.observers.append(timeline)
+    programs = local_programs(spread, lockstep=True)
+    supervisor = Supervisor(programs, Path("runs/logs"), respawn=False, wait_ready=False)
+    async with supervisor:
+        await asyncio.to_thread(_go, member, lambda: party.over)
+    return party
+
+
+def _go(member: Any, until: Callable[[], bool]) -> None:
+    member.open()
+    member.run(until)
+
+
+# --- real time ---------------------------------------------------------------------------------------------------------
+
+
+async def _run_realtime(
+    directory: Directory, setting: Setting, options: argparse.Namespace
+) -> tuple[Mission, Timeline]:
+    from coordinator.launch import realtime_mission
+    from coordinator.realtime import RealtimeMission, UnreachableError, key_of
+    from coordinator.supervisor import LaunchError
+    from coordinator.timeline import Timeline
+
+    timeline = Timeline()
+    mission = realtime_mission(directory, setting)
+    mission.executor.observers.append(timeline)
+    try:
+        async with _nodes(directory, options):
+            shell = RealtimeMission(mission, directory, key_of(directory))
+            try:
+                await shell.connect()
+                with _progress(options) as watch:
+                    await _watched(shell.run(), mission, watch)
+            finally:
+                await shell.close()
+    except (UnreachableError, LaunchError) as fault:
+        raise CommandError(3, str(fault)) from fault
+    return mission, timeline
+
+
+def _nodes(directory: Directory, options: argparse.Namespace) -> AbstractAsyncContextManager[Any]:
+    if not options.up:
+        return nullcontext()
+    from coordinator.launch import local_programs
+    from coordinator.supervisor import Supervisor
+
+    return Supervisor(local_programs(directory), Path("runs/logs"), notice=print)
+
+
+async def _watched(running: Any, mission: Mission, watch: Callable[[Mission, float], None] | None) -> None:
+    task = asyncio.ensure_future(running)
+    while not task.done():
+        if watch is not None:
+            watch(mission, asyncio.get_running_loop().time())
+        await asyncio.wait({task}, timeout=0.1)
+    await task
+
+
+# --- what people see ---------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _progress(options: argparse.Namespace) -> Iterator[Callable[[Mission, float], None] | None]:
+    if options.quiet or options.json == "-":
+        yield None
+        return
+    from coordinator.cli.progress import live_progress
+
+    with live_progress() as watch:
+        yield watch
+
+
+def _give(result: dict[str, Any], task: Task, timeline: Timeline, options: argparse.Namespace) -> None:
+    if options.json:
+        write_json(options.json, result)
+    if options.json != "-":
+        from coordinator.cli.progress import print_result
+
+        print_result(result)
+    if options.report is not None:
+        from coordinator.drawing import draw
+        from coordinator.report import report_html
+
+        options.report.mkdir(parents=True, exist_ok=True)
+        write_json(str(options.report / "result.json"), result)
+        page = options.report / "index.html"
+        page.write_text(report_html(result, timeline, draw(task, error_branches=True)), encoding="utf-8")
+        print(f"report: {page}")

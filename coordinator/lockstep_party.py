@@ -1,0 +1,58 @@
+"""The coordinator as a party of a lock-step cell: a mission run whose callers speak through envelopes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from coordinator.mission import Mission, Stage
+from services.comm.directory import Directory
+from services.comm.messages import Call, Message
+from services.comm.party import Envelope
+
+NAME = "coordinator"
+
+
+class CoordinatorParty:
+    """Implements `services.comm.party.Party`. `watch(now)` is called once a tick, for progress shown to people."""
+
+    def __init__(self, directory: Directory, mission: Mission, watch: Callable[[float], None] | None = None) -> None:
+        self.name = NAME
+        self.mission = mission
+        self._directory = directory
+        self._watch = watch
+        self._now = 0.0
+        for caller in mission.callers.values():
+            caller.open(0.0)
+
+    @property
+    def over(self) -> bool:
+        """Whether the mission run has ended and been scored."""
+        return self.mission.stage is Stage.OVER
+
+    def receive(self, now: float, envelope: Envelope) -> None:
+        """Take a node's message."""
+        node = self._directory.party(envelope.source)
+        self.mission.callers[node].receive(now, envelope.body)
+
+    def advance(self, now: float) -> None:
+        """Begin once every node has welcomed us; then do what is due."""
+        mission, self._now = self.mission, now
+        for node, caller in mission.callers.items():
+            caller.advance(now)
+            mission.take(now, node, caller.notices())
+        if mission.stage is Stage.CONNECTING and all(caller.up for caller in mission.callers.values()):
+            mission.start(now)
+        if self._watch is not None:
+            self._watch(now)
+
+    def drain(self) -> Sequence[Envelope]:
+        """What was sent since the last call, in order."""
+        return [
+            Envelope(node, NAME, _target(node, message), "call", message)
+            for node, caller in self.mission.callers.items()
+            for message in caller.messages(self._now)
+        ]
+
+
+def _target(node: str, message: Message) -> str:
+    return message.service if isinstance(message, Call) else node

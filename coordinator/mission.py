@@ -1,0 +1,212 @@
+"""A mission run from beginning to end: prepare the cell, execute the task, ask for the score. A machine like its parts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+from coordinator.engine.instructions import Fired, Instruction, Report, RunRecorded, Severity, StartRun
+from coordinator.engine.stimuli import Begin, Stimulus
+from coordinator.executor import Executor
+from coordinator.net import Marking
+from coordinator.task import Status
+from services.comm.caller import Caller
+from services.comm.messages import Call, Outcome
+from services.comm.notice import Ended, Notice, PeerBack, PeerLost, Progress
+
+SERVICE_DEADLINE = 20.0
+
+
+class Stage(Enum):
+    """Where a mission run stands."""
+
+    CONNECTING = "connecting"
+    PREPARING = "preparing"
+    RUNNING = "running"
+    SCORING = "scoring"
+    OVER = "over"
+
+
+class MissionError(Exception):
+    """A mission run could not be prepared or scored: which service said what."""
+
+
+@dataclass(slots=True)
+class Cycle:
+    """One token taken out of the runs place, and what became of the runs that followed."""
+
+    number: int
+    begun: float
+    ended: float | None = None
+    status: Status = Status.SUCCESS
+    cause: str = ""
+    text: str = ""
+
+    def count(self, record: RunRecorded) -> None:
+        """Take a run into account: the worst status counts, the first cause of it is kept."""
+        rank = {Status.SUCCESS: 0, Status.FAILURE: 1, Status.ERROR: 2}
+        if record.status is not None and rank[record.status] > rank[self.status]:
+            self.status, self.cause, self.text = record.status, record.cause, record.text
+
+    def plain(self, now: float) -> dict[str, Any]:
+        """Plain data; times as ages, since only durations cross the wire (s)."""
+        ended = now if self.ended is None else self.ended
+        ages = {"begun_ago": now - self.begun, "ended_ago": now - ended}
+        return {"n": self.number, **ages, "status": self.status.value, "cause": self.cause, "text": self.text}
+
+
+@dataclass
+class Tally:
+    """An observer that counts what the result needs: firings, cycles, runs and reports."""
+
+    runs_place: int | None
+    firings: int = 0
+    cycles: list[Cycle] = field(default_factory=list)
+    runs: list[RunRecorded] = field(default_factory=list)
+    reports: list[Report] = field(default_factory=list)
+    chosen: dict[str, str] = field(default_factory=dict)
+
+    def instruction(self, now: float, instruction: Instruction) -> None:
+        """Count."""
+        if isinstance(instruction, Fired):
+            self.firings += 1
+            self._cycle(now, instruction.before, instruction.after)
+        elif isinstance(instruction, RunRecorded):
+            self.runs.append(instruction)
+            if self.cycles:
+                self.cycles[-1].count(instruction)
+        elif isinstance(instruction, StartRun):
+            self.chosen[instruction.run] = instruction.action
+        elif isinstance(instruction, Report) and instruction.severity is not Severity.NOTE:
+            self.reports.append(instruction)
+
+    def stimulus(self, now: float, stimulus: Stimulus) -> None:
+        """Nothing to count."""
+
+    def progress(self, now: float, run: str, notice: Progress) -> None:
+        """Nothing to count."""
+
+    def _cycle(self, now: float, before: Marking, after: Marking) -> None:
+        if self.runs_place is None or after[self.runs_place] >= before[self.runs_place]:
+            return
+        if self.cycles:
+            self.cycles[-1].ended = now
+        self.cycles.append(Cycle(len(self.cycles) + 1, now))
+
+
+class Mission:
+    """One mission run over its executor's callers."""
+
+    def __init__(self, executor: Executor, parameters: Mapping[str, Any], runs: int) -> None:
+        self.executor = executor
+        self.parameters = dict(parameters)
+        self.runs = runs
+        self.stage = Stage.CONNECTING
+        self.score: Mapping[str, Any] = {}
+        self.begun = self.ended = 0.0
+        self.lost: dict[str, str] = {}
+        """Nodes that are away, with the reason."""
+        task = executor.task.flat
+        index = task.net.place_index.get(task.runs_place) if task.runs_place else None
+        self.tally = Tally(index)
+        executor.observers.append(self.tally)
+
+    @property
+    def callers(self) -> Mapping[str, Caller]:
+        """One caller for each node."""
+        return self.executor.callers
+
+    def start(self, now: float) -> None:
+        """The nodes are there: prepare the cell, or begin at once when nothing is to be prepared."""
+        self.executor.subscribe(now)
+        if not self._ask(now, "prepare", self.executor.task.prepare, self._preparation()):
+            self._begin(now)
+        else:
+            self.stage = Stage.PREPARING
+
+    def take(self, now: float, node: str, notices: Sequence[Notice]) -> None:
+        """Take what a node's caller noticed."""
+        self._note_links(node, notices)
+        own = [n for n in notices if isinstance(n, Ended) and self._is_own(n.outcome)]
+        for notice in own:
+            self.callers[node].acknowledge(now, notice.outcome.id)
+            self._answered(now, notice.outcome)
+        self.executor.take(now, node, [n for n in notices if n not in own])
+        self.advance(now)
+
+    def advance(self, now: float) -> None:
+        """Do what is due."""
+        if self.stage is Stage.RUNNING:
+            self.executor.advance(now)
+            if self.executor.finished is not None:
+                self._finish(now)
+
+    def due(self) -> float | None:
+        """When `advance` has something to do next."""
+        return self.executor.due() if self.stage is Stage.RUNNING else None
+
+    def result(self, mode: str, wall_s: float) -> dict[str, Any]:
+        """The result as the command line writes it; the score's own keys stand beside the general ones."""
+        finished = self.executor.finished
+        general = {
+            "task": self.executor.task.name,
+            "mode": mode,
+            **self.parameters,
+            "seed": self.executor.seed,
+            "runs": self.runs,
+            "status": finished.status.value if finished else Status.ERROR.value,
+            "reason": finished.reason if finished else "not finished",
+        }
+        durations = {
+            "wall_s": round(wall_s, 3),
+            "sim_s": round(self.ended - self.begun, 6),
+            "firings": self.tally.firings,
+        }
+        return {**general, **self.score, **durations}
+
+    # --- stages ----------------------------------------------------------------------------------------------------
+
+    def _preparation(self) -> dict[str, Any]:
+        return {**self.parameters, "seed": self.executor.seed, "runs": self.runs}
+
+    def _begin(self, now: float) -> None:
+        self.stage, self.begun = Stage.RUNNING, now
+        self.executor.stimulate(now, Begin(self.parameters))
+
+    def _finish(self, now: float) -> None:
+        self.ended = now
+        if self.tally.cycles:
+            self.tally.cycles[-1].ended = now
+        cycles = [cycle.plain(now) for cycle in self.tally.cycles]
+        asked = self._ask(now, "score", self.executor.task.score, {"cycles": cycles})
+        self.stage = Stage.SCORING if asked else Stage.OVER
+
+    def _ask(self, now: float, what: str, service: str, arguments: Mapping[str, Any]) -> bool:
+        """Call a service of the task's; False when it names none, or none is placed (a real cell has no referee)."""
+        if not service or service not in self.executor.directory.services:
+            return False
+        caller = self.callers[self.executor.directory.where(service)]
+        identity = f"{self.executor.mission}/{what}"
+        caller.call(now, Call(identity, service, arguments, SERVICE_DEADLINE, seed=self.executor.seed))
+        return True
+
+    def _is_own(self, outcome: Outcome) -> bool:
+        return outcome.id in (f"{self.executor.mission}/prepare", f"{self.executor.mission}/score")
+
+    def _answered(self, now: float, outcome: Outcome) -> None:
+        if outcome.status != Status.SUCCESS:
+            what = outcome.id.rpartition("/")[2]
+            raise MissionError(f"{what}: {outcome.cause}: {outcome.text}")
+        if self.stage is Stage.PREPARING:
+            self._begin(now)
+        elif self.stage is Stage.SCORING:
+            self.score, self.stage = outcome.values, Stage.OVER
+
+    def _note_links(self, node: str, notices: Sequence[Notice]) -> None:
+        for notice in notices:
+            if isinstance(notice, PeerLost):
+                self.lost[node] = notice.reason
+            elif isinstance(notice, PeerBack):
+                self.lost.pop(node, None)

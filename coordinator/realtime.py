@@ -1,0 +1,92 @@
+"""The coordinator on the wall clock: one client for each node, timers on the asyncio loop."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from coordinator.mission import Mission, MissionError, Stage
+from services.comm.client import Client
+from services.comm.directory import Directory
+from services.comm.notice import Notice
+
+
+class UnreachableError(Exception):
+    """Nodes that should be there are not; `nodes` names them."""
+
+    def __init__(self, nodes: Sequence[str], text: str) -> None:
+        super().__init__(text)
+        self.nodes = tuple(nodes)
+
+
+class RealtimeMission:
+    """Drives a mission run: what clients notice goes in, what it calls goes out, timers wake it."""
+
+    def __init__(self, mission: Mission, directory: Directory, key: bytes | None = None) -> None:
+        self.mission = mission
+        self._loop = asyncio.get_running_loop()
+        self._over = asyncio.Event()
+        self._fault: BaseException | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self.clients: Mapping[str, Client] = {
+            name: Client(node.host, node.port, mission.callers[name], on_notices=self._hear(name), key=key)
+            for name, node in directory.nodes.items()
+        }
+
+    async def connect(self, timeout: float = 5.0) -> None:
+        """Reach every node. Raises UnreachableError that names those that are not there."""
+        for client in self.clients.values():
+            client.start()
+        reached = await asyncio.gather(*(client.connected(timeout) for client in self.clients.values()))
+        missing = [name for name, up in zip(self.clients, reached, strict=True) if not up]
+        if missing:
+            addresses = ", ".join(f"{n} at {self.clients[n].host}:{self.clients[n].port}" for n in missing)
+            raise UnreachableError(missing, f"no answer from {addresses}; launch them with `petrobot up`")
+
+    async def run(self) -> None:
+        """Run the mission to its end. Raises MissionError."""
+        self.mission.start(self._loop.time())
+        self.settle()
+        await self._over.wait()
+        if self._fault is not None:
+            raise self._fault
+
+    async def close(self) -> None:
+        """Leave the nodes in good order."""
+        if self._timer is not None:
+            self._timer.cancel()
+        await asyncio.gather(*(client.close() for client in self.clients.values()))
+
+    def settle(self) -> None:
+        """Send what was said, and wake up in time for what is due next; call it after each use of the mission."""
+        for client in self.clients.values():
+            client.flush()
+        if self.mission.stage is Stage.OVER:
+            self._over.set()
+            return
+        due = self.mission.due()
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = None if due is None else self._loop.call_at(due, self._wake)
+
+    def _wake(self) -> None:
+        self._guarded(lambda now: self.mission.advance(now))
+
+    def _hear(self, node: str) -> Callable[[float, list[Notice]], None]:
+        return lambda _, notices: self._guarded(lambda now: self.mission.take(now, node, notices))
+
+    def _guarded(self, step: Callable[[float], None]) -> None:
+        try:
+            step(self._loop.time())
+        except MissionError as fault:
+            self._fault = fault
+            self._over.set()
+            return
+        self._loop.call_soon(self.settle)
+
+
+def key_of(directory: Directory) -> bytes | None:
+    """The shared key that services.toml names, None without one."""
+    path = directory.keys.get("file")
+    return Path(directory.file(path)).read_bytes().strip() if path else None
