@@ -6,7 +6,7 @@ Framing, both directions. First each end sends the six bytes `PBCAN\\x01`. Then 
     u32  identifier, big-endian; bit 31 extended (29 bits), bit 30 remote, bit 29 error frame
     u8   DLC, 0 to 8
     DLC bytes of data (none in a remote frame)
-A hub (`can_hub`) passes each frame on to all ports but the one it came from, in the order of arrival. A port that sends anything else,
+A hub (`can_hub`) passes each frame on to all ports but the one it came from, in order of arrival. A port that sends other things,
 or does not read while more than 256 KiB wait for it, is dropped. Classic CAN only.
 """
 

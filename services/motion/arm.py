@@ -1,0 +1,372 @@
+"""The driver `Arm`: the PUMA's servo on its bus, in cycles of 4 ms.
+
+Each cycle it reads the bus, moves the commanded trajectory on within the joint limits and the guard's, and sends the drives
+their set points. Commands (plain data, key `do`):
+
+    {"do": "move", "pose": NAME or six angles (rad), "speed": 0 to 1}   all joints arrive together
+    {"do": "follow", "strategy": NAME, ...}    go where the stream's newest prediction can be caught; must be repeated within
+                                               `LEASE` seconds, else the arm holds
+    {"do": "hold"}      come to rest and stay there
+    {"do": "reset"}     forget faults, configure and enable the drives again, hold
+    {"do": "disable"}   come to rest, then take the power away: the brakes hold
+
+No set point older than three of its periods is ever executed: the arm then brakes at its limits and holds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+
+from services.device import Ports, Setpoint
+from services.motion.barrier import Barrier
+from services.motion.drive_master import DriveMaster, DriveSettings, Phase
+from services.motion.following import Follower
+from services.motion.interception import STRATEGIES, Interceptor, Strategy
+from services.motion.kinematics import Puma, branch_of
+from services.motion.limits import Guard
+from services.motion.model import JOINTS, ArmModel, Cell, nominal_arm, nominal_cell, read_arm, read_cell
+from services.motion.trajectory import Trajectory, synchronised
+
+PERIOD: Final = 0.004
+"""s, the servo's and the bus's cycle."""
+LEASE: Final = 0.5
+"""s after which following ends in a hold if the action that asked for it has gone silent."""
+SPEED_SHARE: Final = 0.97
+"""Share of the drives' greatest speed that is commanded: the rest is theirs to catch up with."""
+IN_PLACE: Final = 0.003
+"""rad by which the measured joints may differ from the target that they are said to have reached."""
+LAG_CYCLES: Final = 3
+"""Cycles by which the measured joints follow the commanded ones: bus, interpolation, sampling."""
+BALL: Final = 0x01
+POWER: Final = 0x02
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """The driver's configuration in services.toml: stream of catch points and its period (s), speed (share of the joints'
+    greatest), whether to enable the drives at the start, and files instead of the package's own numbers."""
+
+    stream: str = "catch_point"
+    stream_period: float = 0.02
+    speed: float = 1.0
+    enable: bool = True
+    model: str = ""
+    cell: str = ""
+
+    @classmethod
+    def parse(cls, config: Mapping[str, Any]) -> Settings:
+        """From the device's table; keys that are not the arm's (node, driver, can, ...) are left alone. Raises ValueError."""
+        fields = {name: config[name] for name in cls.__slots__ if name in config}
+        for name, value in fields.items():
+            if isinstance(value, bool) is not isinstance(getattr(cls(), name), bool) or not isinstance(
+                value, str | int | float
+            ):
+                raise ValueError(f"services.toml: arm: {name} = {value!r} is of the wrong kind")
+        settings = cls(**fields)
+        if not 0.0 < settings.speed <= 1.0:
+            raise ValueError(f"services.toml: arm: speed = {settings.speed}: must be above 0 and at most 1")
+        if not settings.stream_period > 0.0:
+            raise ValueError(f"services.toml: arm: stream_period = {settings.stream_period}: must be above 0")
+        return settings
+
+
+class Arm:
+    """Driver of the PUMA (see `services.device.Driver`)."""
+
+    period: float | None = PERIOD
+
+    def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
+        settings = Settings.parse(config)
+        self._ports = ports
+        self._settings = settings
+        self.model, cell = _numbers(settings, ports)
+        self._puma = Puma.of(self.model)
+        self._guard = Guard(self._puma, self.model, cell)
+        home = self.model.poses["home"]
+        self._interceptor = Interceptor(self._puma, cell, self._guard, home, branch_of(self._puma, np.asarray(home)))
+        self._full_speed = (self.model.speed * (settings.speed * SPEED_SHARE)).tolist()
+        self._full_acceleration = self.model.acceleration.tolist()
+        self._trajectory = Trajectory(home, PERIOD, self._full_speed, self._full_acceleration)
+        self._master = DriveMaster(_drive_settings(self.model), PERIOD, enable=settings.enable)
+        self._setpoint: Setpoint = ports.stream(settings.stream)
+        self._bus = ports.can()
+        self._follower = Follower(settings.stream_period)
+        self._ball = Barrier()
+        self._mode = "off"
+        self._reason = ""
+        self._refused = ""
+        self._paused = False
+        self._leased_until = 0.0
+        self._after_stop = ""
+        self._commanded: deque[list[float]] = deque(maxlen=LAG_CYCLES + 1)
+        self._measured = [0.0] * JOINTS
+        self._measured_speed = [0.0] * JOINTS
+        self._cycles = 0
+        self._commands: dict[str, Callable[[float, Mapping[str, Any]], None]] = {
+            "move": self._move,
+            "follow": self._follow,
+            "hold": lambda now, body: self._rest("held"),
+            "reset": self._reset,
+            "disable": self._disable,
+        }
+
+    # Driver contract.
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        """Take a command; raises ValueError for one that is unknown, malformed, or cannot be obeyed now."""
+        act = self._commands.get(str(body.get("do")))
+        if act is None:
+            raise ValueError(f"unknown command {body.get('do')!r}: know {', '.join(self._commands)}")
+        act(now, body)
+
+    def step(self, now: float) -> None:
+        """One cycle."""
+        self._cycles += 1
+        try:
+            frames = self._bus.receive()
+        except ConnectionError as reason:
+            self._master.bus_lost(now, str(reason))
+            frames = ()
+        for frame in frames:
+            self._master.receive(now, frame)
+        self._measure()
+        self._sense(now)
+        self._drive(now)
+        targets = self._trajectory.q if self._mode != "off" else self._master.positions
+        try:
+            for frame in self._master.advance(now, targets):
+                self._bus.send(frame)
+        except ConnectionError as reason:
+            self._master.bus_lost(now, str(reason))
+
+    def state(self) -> Mapping[str, Any]:
+        """What actions, operator and report see; see `docs/motion.md` for the keys."""
+        master, trajectory, follower = self._master, self._trajectory, self._follower
+        return {
+            "enabled": self._mode != "off",
+            "phase": master.phase.value,
+            "mode": self._mode,
+            "reason": self._reason,
+            "paused": self._paused,
+            "q": tuple(self._measured),
+            "qd": tuple(self._measured_speed),
+            "target": tuple(trajectory.target) if trajectory.target is not None else None,
+            "commanded": tuple(trajectory.q),
+            "in_place": self._in_place(),
+            "still": self._standing(),
+            "following_error": self._lag(),
+            "guard": self._refused,
+            "limited": master.limited,
+            "faults": [(trouble.cause, trouble.joint, trouble.code, trouble.text) for trouble in master.troubles],
+            "power": None if master.inputs is None else bool(master.inputs & POWER),
+            "ball_in_cup": self._ball.present,
+            "barrier": self._ball.interrupted,
+            "setpoint_age": follower.age,
+            "setpoint_count": follower.count,
+            "setpoints_refused": follower.refused,
+            "oldest_executed": follower.oldest,
+            "stale_executed": follower.stale,
+            "plan": follower.published(self._ports.now),
+            "cycles": self._cycles,
+        }
+
+    def stop(self, now: float) -> None:
+        """Decelerate at the limits, then hold."""
+        self._rest("stopped")
+
+    def stopped(self) -> bool:
+        """Whether the arm stands still, held by its drives or its brakes."""
+        if self._mode == "off":
+            return self._master.phase is not Phase.RUNNING or max(map(abs, self._measured_speed)) < _STANDING
+        return self._trajectory.still and self._standing()
+
+    def hold(self, now: float) -> str:
+        """Operator's pause: brake, and go on with the same after `release`."""
+        self._paused = True
+        return "held"
+
+    def release(self, now: float) -> None:
+        """End of the pause."""
+        self._paused = False
+        self._leased_until = max(self._leased_until, now + LEASE)
+
+    def close(self) -> None:
+        """Leave the bus; the drives stop by themselves when SYNC and heartbeat cease."""
+        self._bus.close()
+
+    # Commands.
+    def _move(self, now: float, body: Mapping[str, Any]) -> None:
+        self._ready("move")
+        target, share = self._pose(body.get("pose")), _share(body.get("speed", 1.0))
+        why = self._guard.violation(target)
+        if why:
+            raise ValueError(f"pose refused: {why}")
+        speed, acceleration = self._speeds(share), self._full_acceleration
+        if self._trajectory.still:
+            error = np.asarray(target) - np.asarray(self._trajectory.q)
+            limits = synchronised(error, np.asarray(speed), np.asarray(acceleration) * share)
+            speed, acceleration = limits[0].tolist(), limits[1].tolist()
+        self._trajectory.limit(speed, acceleration)
+        self._trajectory.aim(target)
+        self._mode, self._reason = "move", ""
+
+    def _follow(self, now: float, body: Mapping[str, Any]) -> None:
+        self._ready("follow")
+        strategy = _strategy(body, self._follower.strategy)
+        if self._mode != "follow":
+            self._trajectory.limit(self._speeds(), self._full_acceleration)
+            self._follower.begin(self._setpoint.count)
+            self._ball.arm()
+        self._follower.strategy = strategy
+        self._leased_until = now + LEASE
+        self._mode, self._reason = "follow", self._reason if self._mode == "follow" else ""
+
+    def _reset(self, now: float, body: Mapping[str, Any]) -> None:
+        self._master.reset(now)
+        self._off("resetting")
+
+    def _disable(self, now: float, body: Mapping[str, Any]) -> None:
+        self._rest("disabling")
+        self._after_stop = "disable"
+
+    def _ready(self, what: str) -> None:
+        if self._mode == "off":
+            troubles = "; ".join(trouble.text for trouble in self._master.troubles) or self._master.phase.value
+            raise ValueError(f"cannot {what}: the drives are not enabled ({troubles})")
+
+    def _pose(self, pose: Any) -> list[float]:
+        if isinstance(pose, str):
+            if pose not in self.model.poses:
+                raise ValueError(f"unknown pose {pose!r}: know {', '.join(self.model.poses)}")
+            return list(self.model.poses[pose])
+        if not isinstance(pose, Sequence) or len(pose) != JOINTS or not all(math.isfinite(angle) for angle in pose):
+            raise ValueError(f"a pose is a name or {JOINTS} angles in rad, not {pose!r}")
+        return [float(angle) for angle in pose]
+
+    # The cycle.
+    def _speeds(self, share: float = 1.0) -> list[float]:
+        """Joint speeds to command: the settings' or the drives' own, whichever is less (rad/s)."""
+        drives = [SPEED_SHARE * drive.max_speed or math.inf for drive in self._master.drives]
+        return [share * min(mine, theirs) for mine, theirs in zip(self._full_speed, drives, strict=True)]
+
+    def _measure(self) -> None:
+        before, self._measured = self._measured, self._master.positions
+        self._measured_speed = [(new - old) / PERIOD for new, old in zip(self._measured, before, strict=True)]
+
+    def _sense(self, now: float) -> None:
+        """The light barrier."""
+        inputs = self._master.inputs
+        if inputs is not None and self._ball.look(now, bool(inputs & BALL)):
+            self._ports.raise_event("ball_caught")
+
+    def _drive(self, now: float) -> None:
+        """Move the commanded trajectory on by one cycle."""
+        enabled = self._master.enabled
+        if self._mode == "off":
+            if enabled:
+                self._trajectory.reset(self._measured)
+                self._commanded.clear()
+                self._mode, self._reason = "hold", "enabled"
+            return
+        if not enabled:
+            self._off("fault" if self._master.troubles else "disabled")
+            return
+        if self._mode == "follow":
+            self._follow_on(now)
+        self._advance()
+        if self._after_stop and self._trajectory.still:
+            self._after_stop, self._master.wanted = "", False
+
+    def _advance(self) -> None:
+        trajectory = self._trajectory
+        self._commanded.append(trajectory.q)
+        if self._paused:
+            trajectory.accept(*trajectory.braking())
+        elif trajectory.target is None or trajectory.arrived(0.0):
+            trajectory.accept(*trajectory.proposed())
+        else:
+            self._refused = self._guard.advance(trajectory)
+            if self._mode == "follow":
+                self._follower.executed(self._setpoint.age)
+
+    def _follow_on(self, now: float) -> None:
+        """Aim at the newest prediction, or hold where it is stale or the action silent."""
+        follower, trajectory = self._follower, self._trajectory
+        if now > self._leased_until and not self._paused:
+            self._rest("silent_action")
+            return
+        if not follower.take(self._setpoint, now):
+            if follower.fresh(self._setpoint):
+                return
+            trajectory.aim(None)
+            self._reason = "no_setpoint"
+            return
+        plan = follower.plan_with(self._interceptor, trajectory, now)
+        self._reason = "" if plan is not None else "unreachable"
+        if plan is not None:
+            trajectory.aim(plan.q)
+
+    def _rest(self, reason: str) -> None:
+        """Come to rest and stay there."""
+        if self._mode == "off":
+            return
+        self._trajectory.limit(self._speeds(), self._full_acceleration)
+        self._trajectory.aim(None)
+        self._mode, self._reason, self._after_stop = "hold", reason, ""
+
+    def _off(self, reason: str) -> None:
+        self._trajectory.reset(self._measured)
+        self._mode, self._reason, self._after_stop = "off", reason, ""
+
+    def _lag(self) -> float:
+        """Greatest difference of a measured joint from what was commanded when it was due (rad)."""
+        if self._mode == "off" or len(self._commanded) <= LAG_CYCLES:
+            return 0.0
+        return max(abs(a - b) for a, b in zip(self._commanded[0], self._measured, strict=True))
+
+    def _in_place(self) -> bool:
+        target = self._trajectory.target
+        if self._mode == "off" or target is None or not self._trajectory.arrived():
+            return False
+        return max(abs(a - b) for a, b in zip(target, self._measured, strict=True)) < IN_PLACE
+
+    def _standing(self) -> bool:
+        return max(map(abs, self._measured_speed)) < _STANDING
+
+
+_STANDING: Final = 0.01
+"""rad/s below which a joint counts as standing."""
+
+
+def _numbers(settings: Settings, ports: Ports) -> tuple[ArmModel, Cell]:
+    """The arm and the cell: the package's own, or those of the files that the settings name."""
+    model = read_arm(ports.file(settings.model).decode()) if settings.model else nominal_arm()
+    return model, (read_cell(ports.file(settings.cell).decode()) if settings.cell else nominal_cell())
+
+
+def _drive_settings(model: ArmModel) -> list[DriveSettings]:
+    limits = zip(model.lower.tolist(), model.upper.tolist(), model.acceleration.tolist(), strict=True)
+    return [DriveSettings(lower, upper, acceleration) for lower, upper, acceleration in limits]
+
+
+def _share(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value <= 1.0:
+        raise ValueError(f"speed = {value!r}: must be above 0 and at most 1")
+    return float(value)
+
+
+def _strategy(body: Mapping[str, Any], present: Strategy) -> Strategy:
+    """The strategy that a command names, with its own values where it gives any; without a name the present one."""
+    name = body.get("strategy")
+    if name is not None and name not in STRATEGIES:
+        raise ValueError(f"unknown strategy {name!r}: know {', '.join(STRATEGIES)}")
+    strategy = present if name is None else STRATEGIES[name]
+    changes: dict[str, Any] = {key: float(body[key]) for key in ("tilt", "preferred", "margin") if key in body}
+    if "depths" in body:
+        changes["depths"] = tuple(float(depth) for depth in body["depths"])
+    return replace(strategy, **changes) if changes else strategy

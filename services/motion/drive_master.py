@@ -1,0 +1,335 @@
+"""The CANopen master of the arm's bus: configures, starts, enables and watches six drives and the digital inputs.
+
+A machine: frames in, frames out, times passed in. It knows neither trajectories nor actions: each cycle it is given six
+targets (rad) and says what the drives say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final
+
+from services.comm import canopen
+from services.comm.canbus import Frame
+from services.comm.canopen import NmtCommand, NmtState, SdoClient, Transfer, Type
+from services.comm.cia402 import (
+    DEVICE_TYPE,
+    ENABLING,
+    RECEIVED,
+    SENT,
+    SUPPORTED_MODES,
+    Command,
+    Fault,
+    Mode,
+    Object,
+    State,
+    StatusBit,
+    fault_text,
+    from_units,
+    state_of,
+    to_units,
+)
+
+MASTER_NODE: Final = 0x7F
+"""Node id under which the master sends its own heartbeat."""
+HEARTBEAT_MS: Final = 50
+"""Period of everybody's heartbeat."""
+HEARTBEAT_PATIENCE_MS: Final = 200
+"""Silence after which a node counts as lost (both ways)."""
+SILENT_CYCLES: Final = 5
+"""Cycles without a drive's TPDO after which it counts as lost."""
+RETRY: Final = 1.0
+"""Seconds before a failed configuration is tried again."""
+RESET_CYCLES: Final = 10
+"""Cycles between two fault resets."""
+INPUT_TIMER_MS: Final = 100
+
+_U8, _U16, _U32, _I8, _I32 = Type.UNSIGNED8, Type.UNSIGNED16, Type.UNSIGNED32, Type.INTEGER8, Type.INTEGER32
+_TPDO: Final = canopen.pdo_struct(SENT)
+_RPDO: Final = canopen.pdo_struct(RECEIVED)
+
+
+class Phase(Enum):
+    """What the master is doing."""
+
+    CONFIGURING = "configuring"
+    """SDO transfers are under way, or are waiting to be tried again."""
+    STARTING = "starting"
+    """Nodes are ordered into OPERATIONAL; not all have sent process data yet."""
+    RUNNING = "running"
+    """All drives answer each SYNC."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trouble:
+    """Something that needs a reset. `cause` is a short code, `joint` 0 to 5 or None, `code` an EMCY error code or 0."""
+
+    cause: str
+    joint: int | None
+    code: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class DriveSettings:
+    """What a drive is configured with: SI units."""
+
+    lower: float
+    upper: float
+    quick_stop: float
+    following_error: float = 0.10
+    following_time: float = 0.04
+
+
+class DriveLink:
+    """What the master knows of one drive."""
+
+    def __init__(self, node: int, settings: DriveSettings) -> None:
+        self.node = node
+        self.settings = settings
+        self.sdo = SdoClient(node)
+        self.state = State.NOT_READY_TO_SWITCH_ON
+        self.statusword = 0
+        self.position = 0.0
+        self.torque = 0.0
+        self.silent = 0
+        self.max_speed = 0.0
+        self.error_code = 0
+        self.controlword = 0
+        self._wait = 0
+
+    def transfers(self, cycle: float) -> list[Transfer]:
+        """The configuration of this drive for a bus cycle of so many seconds, and what is read from it."""
+        beat = MASTER_NODE << 16 | HEARTBEAT_PATIENCE_MS
+        settings = self.settings
+        return [
+            Transfer(Object.DEVICE_TYPE, 0, _U32),
+            Transfer(Object.SUPPORTED_MODES, 0, _U32),
+            Transfer(Object.MAX_SPEED, 0, _U32),
+            Transfer(Object.PRODUCER_HEARTBEAT, 0, _U16, HEARTBEAT_MS),
+            Transfer(Object.CONSUMER_HEARTBEAT, 1, _U32, beat),
+            Transfer(Object.SYNC_PERIOD, 0, _U32, round(cycle * 1e6)),
+            Transfer(Object.MODE, 0, _I8, Mode.CYCLIC_SYNCHRONOUS_POSITION),
+            Transfer(Object.INTERPOLATION_PERIOD, 1, _U8, round(cycle * 1e3)),
+            Transfer(Object.INTERPOLATION_PERIOD, 2, _I8, -3),
+            Transfer(Object.SOFTWARE_LIMITS, 1, _I32, to_units(settings.lower)),
+            Transfer(Object.SOFTWARE_LIMITS, 2, _I32, to_units(settings.upper)),
+            Transfer(Object.FOLLOWING_ERROR_WINDOW, 0, _U32, to_units(settings.following_error)),
+            Transfer(Object.FOLLOWING_ERROR_TIMEOUT, 0, _U16, round(settings.following_time * 1e3)),
+            Transfer(Object.QUICK_STOP_DECELERATION, 0, _U32, to_units(settings.quick_stop)),
+            *canopen.map_pdo(Object.RPDO1, Object.RPDO1_MAPPING, canopen.RPDO1_BASE + self.node, 1, RECEIVED),
+            *canopen.map_pdo(Object.TPDO1, Object.TPDO1_MAPPING, canopen.TPDO1_BASE + self.node, 1, SENT),
+        ]
+
+    def wrong(self) -> str:
+        """What makes the device at this node unfit, in words; empty if nothing. Takes over its greatest speed."""
+        device, modes = self.sdo.results[Object.DEVICE_TYPE, 0], self.sdo.results[Object.SUPPORTED_MODES, 0]
+        if device != DEVICE_TYPE:
+            return f"node {self.node} is no servo drive (object 1000h is {device:#010x}): check the node ids"
+        if not modes & SUPPORTED_MODES:
+            return f"node {self.node} does not know cyclic synchronous position"
+        self.max_speed = from_units(self.sdo.results[Object.MAX_SPEED, 0])
+        return ""
+
+    def take(self, data: bytes) -> None:
+        """The drive's TPDO. Raises ValueError for bytes that are none."""
+        if len(data) != _TPDO.size:
+            raise ValueError(f"TPDO of node {self.node} has {len(data)} bytes, must have {_TPDO.size}")
+        self.statusword, position, torque = _TPDO.unpack(data)
+        self.state = state_of(self.statusword)
+        self.position, self.torque, self.silent = from_units(position), torque / 1e3, 0
+
+    def frame(self, target: float, wanted: bool, resetting: bool) -> Frame:
+        """The RPDO: a controlword that leads to where the master wants the drive, and the target position (rad)."""
+        if not wanted:
+            command = Command.QUICK_STOP if self.state in _MOVING else Command.DISABLE_VOLTAGE
+        elif self.state is State.FAULT:
+            self._wait = (self._wait + 1) % RESET_CYCLES
+            command = Command.FAULT_RESET if resetting and self._wait == 1 else Command.DISABLE_VOLTAGE
+        else:
+            command = ENABLING.get(self.state, Command.DISABLE_VOLTAGE)
+        self.controlword = command.word
+        return Frame(canopen.RPDO1_BASE + self.node, _RPDO.pack(command.word, to_units(target)))
+
+
+_MOVING: Final = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE)
+
+
+class DriveMaster:
+    """Master of nodes 1 to 6 (drives, base to flange) and `inputs` (digital inputs)."""
+
+    def __init__(self, settings: Sequence[DriveSettings], cycle: float, inputs: int = 7, enable: bool = True) -> None:
+        """`cycle` in seconds; with `enable` the drives are enabled as soon as they are there for the first time."""
+        self.cycle = cycle
+        self.drives = [DriveLink(number, each) for number, each in enumerate(settings, 1)]
+        self.inputs_node = inputs
+        self.inputs: int | None = None
+        self.wanted = False
+        """Whether the drives are to be enabled."""
+        self.phase = Phase.CONFIGURING
+        self.troubles: list[Trouble] = []
+        self._input_sdo = SdoClient(inputs)
+        self._by_tpdo = {canopen.TPDO1_BASE + drive.node: drive for drive in self.drives}
+        self._heard = dict.fromkeys([*(drive.node for drive in self.drives), inputs], 0.0)
+        self._begin_at: float | None = 0.0
+        self._beat_due = 0.0
+        self._resetting = False
+        self._enable_first = enable
+
+    @property
+    def enabled(self) -> bool:
+        """Whether all drives follow set points."""
+        return self.phase is Phase.RUNNING and all(drive.state is State.OPERATION_ENABLED for drive in self.drives)
+
+    @property
+    def positions(self) -> list[float]:
+        """Joint angles as the drives last said (rad)."""
+        return [drive.position for drive in self.drives]
+
+    @property
+    def limited(self) -> bool:
+        """Whether a drive cuts its set points because they are faster than it goes."""
+        return any(drive.statusword & StatusBit.INTERNAL_LIMIT for drive in self.drives)
+
+    def reset(self, now: float) -> None:
+        """Forget troubles, reset faults, configure again."""
+        self.troubles.clear()
+        self._resetting, self.wanted = True, True
+        for drive in self.drives:
+            drive.error_code = 0
+        self.phase, self._begin_at = Phase.CONFIGURING, now
+
+    def bus_lost(self, now: float, why: str) -> None:
+        """The bus itself is gone: nothing is enabled any more; configure again when it is back."""
+        self._report(Trouble("bus", None, 0, why))
+        self.phase, self._begin_at = Phase.CONFIGURING, now + RETRY
+
+    def receive(self, now: float, frame: Frame) -> None:
+        """A frame off the bus; what cannot be understood is ignored."""
+        drive = self._by_tpdo.get(frame.id)
+        if drive is not None:
+            try:
+                drive.take(frame.data)
+            except ValueError:
+                return  # not ours: silence will show
+        elif frame.id == canopen.TPDO1_BASE + self.inputs_node:
+            if frame.data:
+                self.inputs = frame.data[0]
+        elif frame.id > canopen.HEARTBEAT_BASE:
+            self._beat(now, frame)
+        elif frame.id > canopen.SDO_REPLY_BASE:
+            for client in (*(each.sdo for each in self.drives), self._input_sdo):
+                client.receive(frame)
+        elif canopen.EMCY_BASE < frame.id < canopen.TPDO1_BASE:
+            self._emergency(frame)
+
+    def advance(self, now: float, targets: Sequence[float]) -> list[Frame]:
+        """Frames of one cycle: configuration, or set points (rad) and SYNC; heartbeat when due."""
+        frames: list[Frame] = []
+        if now >= self._beat_due:
+            self._beat_due = now + HEARTBEAT_MS / 1e3
+            frames.append(canopen.heartbeat(MASTER_NODE, NmtState.OPERATIONAL))
+        if self.phase is Phase.CONFIGURING:
+            frames += self._configure(now)
+        else:
+            self._supervise(now)
+            frames += [
+                drive.frame(target, self.wanted, self._resetting)
+                for drive, target in zip(self.drives, targets, strict=True)
+            ]
+            frames.append(canopen.SYNC)
+        return frames
+
+    def _configure(self, now: float) -> list[Frame]:
+        clients = [*(drive.sdo for drive in self.drives), self._input_sdo]
+        if self._begin_at is not None:
+            if now < self._begin_at:
+                return []
+            self._begin_at = None
+            for drive in self.drives:
+                drive.sdo.begin(drive.transfers(self.cycle))
+            self._input_sdo.begin(self._input_transfers())
+            return [canopen.nmt(NmtCommand.ENTER_PREOPERATIONAL)]
+        if any(client.busy for client in clients):
+            return [frame for client in clients for frame in client.advance(now)]
+        return self._start(now, clients)
+
+    def _start(self, now: float, clients: Sequence[SdoClient]) -> list[Frame]:
+        """All transfers are over: start the nodes, or say what failed and try again later."""
+        wrong = [client.failure for client in clients if client.failure]
+        wrong = wrong or [text for text in (drive.wrong() for drive in self.drives) if text]
+        if wrong:
+            self._report(Trouble("bus", None, 0, "; ".join(wrong)))
+            self._begin_at = now + RETRY
+            return []
+        if self._enable_first:
+            self._enable_first, self.wanted = False, True
+            self._resetting = True  # the drives may have gone into a fault when their last master went away
+            self.troubles.clear()
+        self.phase = Phase.STARTING
+        for drive in self.drives:
+            drive.silent = 0
+        self._heard = dict.fromkeys(self._heard, now)
+        return [canopen.nmt(NmtCommand.START)]
+
+    def _input_transfers(self) -> list[Transfer]:
+        parameters, mapping = Object.TPDO1, Object.TPDO1_MAPPING
+        objects = [canopen.Mapped(0x6000, 1, _U8)]
+        return [
+            Transfer(Object.PRODUCER_HEARTBEAT, 0, _U16, HEARTBEAT_MS),
+            Transfer(parameters, 5, _U16, INPUT_TIMER_MS),
+            *canopen.map_pdo(parameters, mapping, canopen.TPDO1_BASE + self.inputs_node, 255, objects),
+        ]
+
+    def _supervise(self, now: float) -> None:
+        """Silence, lost heartbeats, and the end of starting and of a reset."""
+        for drive in self.drives:
+            drive.silent += 1
+            if drive.silent == SILENT_CYCLES + 1:
+                self._report(Trouble("bus", drive.node - 1, 0, f"drive {drive.node} is silent"))
+            if drive.state is State.FAULT and not self._resetting and drive.silent <= 1:
+                self._fault(drive, drive.error_code)
+        for node, heard in self._heard.items():
+            if now - heard > HEARTBEAT_PATIENCE_MS / 1e3:
+                self._report(Trouble("bus", None, 0, f"node {node} sends no heartbeat"))
+        if self.phase is Phase.STARTING and all(drive.silent <= 1 for drive in self.drives):
+            self.phase = Phase.RUNNING
+        if self.enabled:
+            self._resetting = False
+
+    def _beat(self, now: float, frame: Frame) -> None:
+        node = frame.id - canopen.HEARTBEAT_BASE
+        if node not in self._heard or len(frame.data) != 1:
+            return
+        self._heard[node] = now
+        if frame.data[0] == NmtState.BOOT_UP and self.phase is not Phase.CONFIGURING:
+            self._report(
+                Trouble("bus", node - 1 if node <= len(self.drives) else None, 0, f"node {node} has restarted")
+            )
+
+    def _emergency(self, frame: Frame) -> None:
+        try:
+            message = canopen.parse_emergency(frame)
+        except ValueError:
+            return
+        if 1 <= message.node <= len(self.drives):
+            drive = self.drives[message.node - 1]
+            drive.error_code = message.code
+            if message.code:
+                self._fault(drive, message.code)
+
+    def _fault(self, drive: DriveLink, code: int) -> None:
+        cause = "power" if code == Fault.UNDERVOLTAGE else "drive_fault"
+        text = f"joint {drive.node}: {fault_text(code)}" if code else f"joint {drive.node}: drive in fault"
+        self._report(Trouble(cause, drive.node - 1, code, text))
+
+    def _report(self, trouble: Trouble) -> None:
+        """Keep it until a reset (the same one once), and let no drive move on."""
+        self.wanted = False
+        if not any(
+            (each.joint, each.cause, each.code) == (trouble.joint, trouble.cause, trouble.code)
+            for each in self.troubles
+        ):
+            self.troubles.append(trouble)

@@ -1,0 +1,87 @@
+"""Following a stream of catch points: which set points may be executed, and the plan made of the newest one."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+from services.device import Setpoint
+from services.motion.interception import STRATEGIES, Interceptor, Plan, Prediction, Strategy
+from services.motion.trajectory import Trajectory
+
+STALE_PERIODS: Final = 3
+"""Periods of the stream after which a set point is not executed any more."""
+ROUNDING: Final = 1e-9
+"""s by which rounding may carry an age."""
+
+
+class Follower:
+    """The stream's newest prediction and what became of it."""
+
+    def __init__(self, period: float) -> None:
+        self._period = period
+        self.strategy: Strategy = STRATEGIES["tilted"]
+        self.plan: Plan | None = None
+        self._made = 0.0
+        self._prediction: Prediction | None = None
+        self.count = 0
+        self.age = math.inf
+        self.refused = 0
+        self.oldest = 0.0
+        self.stale = 0
+
+    def begin(self, count: int) -> None:
+        """Forget what was: only set points that come from now on count."""
+        self.plan, self._prediction, self.count, self.age = None, None, count, math.inf
+
+    def fresh(self, setpoint: Setpoint) -> bool:
+        """Whether the last set point taken may be executed (still); notes its age."""
+        self.age = setpoint.age if self._prediction is not None else math.inf
+        return setpoint.values is not None and self.age <= STALE_PERIODS * self._period + ROUNDING
+
+    def executed(self, age: float) -> None:
+        """A cycle went towards a set point of this age: kept account of apart from what decides about it."""
+        self.oldest = max(self.oldest, age)
+        self.stale += age > STALE_PERIODS * self._period + ROUNDING
+
+    def take(self, setpoint: Setpoint, now: float) -> bool:
+        """Take a new set point if there is one that may be executed."""
+        if setpoint.count == self.count or setpoint.values is None:
+            return False
+        self.count = setpoint.count
+        try:
+            self._prediction = Prediction.parse(setpoint.values, setpoint.age)
+        except ValueError:
+            self.refused += 1
+            return False
+        return self.fresh(setpoint)
+
+    def plan_with(self, interceptor: Interceptor, trajectory: Trajectory, now: float) -> Plan | None:
+        """Plan for the prediction just taken; None if it cannot be reached (the plan of before is forgotten)."""
+        assert self._prediction is not None
+        self.plan = interceptor.plan(
+            self.strategy,
+            self._prediction,
+            trajectory.q,
+            trajectory.qd,
+            trajectory.speed,
+            trajectory.acceleration,
+            self.plan,
+        )
+        self._made = now
+        return self.plan
+
+    def published(self, now: float) -> dict[str, Any] | None:
+        """The plan as plain data: times are seconds from `now`."""
+        plan, prediction = self.plan, self._prediction
+        if plan is None or prediction is None:
+            return None
+        return {
+            "point": plan.point,
+            "axis": plan.axis,
+            "arrival": plan.arrival - (now - self._made),
+            "slack": plan.slack,
+            "reach": plan.reach,
+            "sigma_y": prediction.sigma_y,
+            "sigma_t": prediction.sigma_t,
+        }

@@ -1,0 +1,198 @@
+"""Where to catch: from a predicted exit over the table's edge to the joint pose that has the cup there in time. Pure.
+
+The ball leaves the edge and falls along a parabola. Along its fall candidates are laid out, each a depth below the edge and
+a turn of the hand about the cup's axis (which leaves the cup where it is, but brings other joints to work); all are solved and
+timed at once, on the arm's own branch. The cheapest is taken: in time first, then quickly reached, near the preferred
+depth, mouth open to the ball. The choice of before keeps a bonus, so that small changes of the prediction move the pose a
+little instead of jumping to another candidate. docs/motion.md tells how depths and tilt were chosen.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from services.motion.kinematics import Branch, Puma
+from services.motion.limits import Guard
+from services.motion.model import Cell, Vector
+from services.motion.trajectory import reach_time
+
+STREAM_LENGTH: Final = 9
+"""Values of a set point of `catch_point`: time_to_go, x, y, z, vx, vy, vz, sigma_y, sigma_t."""
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """Where (m), when (s from now) and how fast (m/s) the ball's centre leaves the table's near edge; base frame."""
+
+    time_to_go: float
+    point: tuple[float, float, float]
+    velocity: tuple[float, float, float]
+    sigma_y: float
+    sigma_t: float
+
+    @classmethod
+    def parse(cls, values: Sequence[float], age: float = 0.0) -> Prediction:
+        """A set point that arrived `age` seconds ago. Raises ValueError if it is none, or moves away from the arm."""
+        if len(values) != STREAM_LENGTH or not all(map(math.isfinite, values)):
+            raise ValueError(f"a catch point has {STREAM_LENGTH} finite numbers, not {list(values)}")
+        go, x, y, z, vx, vy, vz, sigma_y, sigma_t = (float(value) for value in values)
+        if vx >= 0.0 or sigma_y < 0.0 or sigma_t < 0.0:
+            raise ValueError(f"a catch point has vx < 0 and sigmas >= 0, not vx = {vx}, sigmas {sigma_y}, {sigma_t}")
+        return cls(go - age, (x, y, z), (vx, vy, vz), sigma_y, sigma_t)
+
+    def shrunk(self, spread: float) -> Prediction:
+        """Weighed against a prior of y = 0 +- `spread` (m): a coarse prediction moves the arm only a part of the way."""
+        weight = spread * spread / (spread * spread + self.sigma_y * self.sigma_y)
+        x, y, z = self.point
+        vx, vy, vz = self.velocity
+        return replace(self, point=(x, y * weight, z), velocity=(vx, vy * weight, vz))
+
+
+@dataclass(frozen=True, slots=True)
+class Strategy:
+    """How to hold the cup: tilt of its axis from the vertical against the ball (rad), depths below the exit at which to
+    catch (m), the preferred one, and the least cosine between the cup's axis and the ball's way that counts as open."""
+
+    tilt: float
+    depths: tuple[float, ...]
+    preferred: float
+    opening: float
+    hands: tuple[float, ...] = tuple(math.radians(angle) for angle in range(-75, 91, 15))
+    margin: float = 0.03
+    """Seconds by which the arm wants to be there before the ball: the drives' lag and settling."""
+
+
+STRATEGIES: Final = {
+    "tilted": Strategy(math.radians(30.0), (0.045, 0.055, 0.065, 0.08, 0.10, 0.13), 0.055, 0.70),
+    "upright": Strategy(0.0, (0.08, 0.11, 0.14, 0.17, 0.20, 0.24, 0.28), 0.11, 0.72),
+}
+"""By name: `tilted` receives the ball head-on just below the edge, `upright` lets it fall into a level cup further down."""
+
+PRIOR_SPREAD: Final = 0.17
+"""m, standard deviation of where balls leave: uniform within +-0.30 m."""
+KEEP: Final = 0.03
+"""Cost by which another candidate must be better than the present one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A catching pose. Times are seconds from when the plan was made; `slack` is the time left over, negative if late."""
+
+    q: tuple[float, ...]
+    point: tuple[float, float, float]
+    axis: tuple[float, float, float]
+    arrival: float
+    reach: float
+    slack: float
+    candidate: int
+
+
+class Interceptor:
+    """Chooses catching poses for one arm and cup. One `plan` costs about as much as ten servo cycles: make one a prediction."""
+
+    def __init__(self, puma: Puma, cell: Cell, guard: Guard, home: Sequence[float], branch: Branch) -> None:
+        self._puma = puma
+        self._cell = cell
+        self._guard = guard
+        self._branch = branch
+        self._home = np.asarray(home, dtype=float)
+        self._mouth = np.asarray(cell.cup.mouth)
+        axis = np.asarray(cell.cup.axis)
+        outward = np.array([0.0, 0.0, 1.0]) - axis[2] * axis
+        if np.linalg.norm(outward) < 0.1:
+            raise ValueError(
+                "cell.toml: cup: axis must not lie along the flange's axis: turning the hand would do nothing"
+            )
+        outward /= np.linalg.norm(outward)
+        self._mount = np.column_stack([axis, outward, np.cross(axis, outward)])
+
+    def plan(
+        self,
+        strategy: Strategy,
+        prediction: Prediction,
+        q: Sequence[float],
+        qd: Sequence[float],
+        speed: Sequence[float],
+        acceleration: Sequence[float],
+        before: Plan | None = None,
+    ) -> Plan | None:
+        """The best catching pose from the arm's state and limits (rad, rad/s, rad/s^2); None if no candidate can be reached."""
+        prediction = prediction.shrunk(PRIOR_SPREAD)
+        points, fall, ways = self._fall(strategy, prediction)
+        axis = _against(prediction.velocity, strategy.tilt)
+        poses = self._poses(points, axis, strategy)
+        solved = self._puma.inverse(poses, (self._branch,), near=self._home)[:, 0]
+        times = reach_time(solved - np.asarray(q), np.asarray(qd), np.asarray(speed), np.asarray(acceleration)).max(
+            axis=1
+        )
+        hands = len(strategy.hands)
+        arrival = np.repeat(prediction.time_to_go + fall, hands)
+        slack = arrival - strategy.margin - times
+        cost = self._cost(strategy, np.repeat(-(ways @ axis), hands), slack, times)
+        if before is not None and before.candidate < len(cost):
+            cost[before.candidate] -= KEEP
+        for index in np.argsort(cost):
+            if not math.isfinite(cost[index]):
+                return None
+            pose = solved[index].tolist()
+            if not self._guard.violation(pose):
+                x, y, z = points[index // hands].tolist()
+                ax, ay, az = axis.tolist()
+                return Plan(
+                    tuple(pose),
+                    (x, y, z),
+                    (ax, ay, az),
+                    float(arrival[index]),
+                    float(times[index]),
+                    float(slack[index]),
+                    int(index),
+                )
+        return None
+
+    def _fall(self, strategy: Strategy, prediction: Prediction) -> tuple[Vector, Vector, Vector]:
+        """Points (n, 3) of the parabola at the strategy's depths, when the ball is there (n,; s after the edge), and its
+        direction there (n, 3; unit)."""
+        gravity = self._cell.gravity
+        depths = np.asarray(strategy.depths)
+        vx, vy, vz = prediction.velocity
+        fall = (vz + np.sqrt(vz * vz + 2.0 * gravity * depths)) / gravity
+        x, y, z = prediction.point
+        points = np.column_stack([x + vx * fall, y + vy * fall, z - depths])
+        ways = np.column_stack([np.full_like(fall, vx), np.full_like(fall, vy), vz - gravity * fall])
+        return points, fall, ways / np.linalg.norm(ways, axis=1, keepdims=True)
+
+    def _poses(self, points: Vector, axis: Vector, strategy: Strategy) -> Vector:
+        """Poses (n * hands, 4, 4) of frame 6 with the cup's mouth at the points, its axis as given, in all turns of the hand."""
+        ahead = np.array([1.0, 0.0, 0.0]) - axis[0] * axis
+        ahead /= np.linalg.norm(ahead)
+        side = np.cross(axis, ahead)
+        turns = np.asarray(strategy.hands)
+        cosine, sine = np.cos(turns)[:, None], np.sin(turns)[:, None]
+        outward, third = cosine * ahead + sine * side, cosine * side - sine * ahead
+        frames = np.stack([np.broadcast_to(axis, outward.shape), outward, third], axis=2)
+        rotations = frames @ self._mount.T
+        poses = np.zeros((len(points), len(turns), 4, 4))
+        poses[..., :3, :3] = rotations
+        poses[..., :3, 3] = points[:, None] - rotations @ self._mouth
+        poses[..., 3, 3] = 1.0
+        return poses.reshape(-1, 4, 4)
+
+    def _cost(self, strategy: Strategy, opening: Vector, slack: Vector, times: Vector) -> Vector:
+        """Cost of each candidate, about in seconds; inf where it cannot be reached."""
+        depth = np.repeat(np.asarray(strategy.depths), len(strategy.hands))
+        cost = times + 2.0 * np.abs(depth - strategy.preferred)
+        cost += 4.0 * np.maximum(strategy.opening - opening, 0.0)
+        cost += 20.0 * np.maximum(-slack, 0.0) + np.maximum(0.05 - slack, 0.0)
+        return np.where(np.isnan(cost), np.inf, cost)
+
+
+def _against(velocity: tuple[float, float, float], tilt: float) -> Vector:
+    """Unit vector tilted from the vertical towards where the ball comes from."""
+    speed = math.hypot(velocity[0], velocity[1])
+    share = math.sin(tilt) / speed if speed > 0.0 else 0.0
+    return np.array([-velocity[0] * share, -velocity[1] * share, math.cos(tilt)])
