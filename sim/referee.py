@@ -1,0 +1,81 @@
+"""Keeps the score: what was thrown, what could have been caught, what was, and how far off the rest went by."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sim.oracle import Oracle, Verdict
+from sim.thrower import Throw
+from sim.world import Course, Outcome
+
+
+@dataclass(frozen=True, slots=True)
+class _Entry:
+    course: Course
+    verdict: Verdict
+
+
+class Referee:
+    """Writes down each throw from its release on. `began` is the simulated time (s) from which releases are counted."""
+
+    def __init__(self, seed: int, regime: str, oracle: Oracle, began: float) -> None:
+        self._seed = seed
+        self._regime = regime
+        self._oracle = oracle
+        self._began = began
+        self._entries: list[_Entry] = []
+
+    def enter(self, course: Course, q: Sequence[float]) -> Verdict:
+        """A ball was released with the arm's encoders at `q` (six, rad); its `course` is read again for the score."""
+        verdict = self._oracle.judge(course.throw, q)
+        self._entries.append(_Entry(course, verdict))
+        return verdict
+
+    @property
+    def last(self) -> Verdict | None:
+        """Verdict on the newest throw."""
+        return self._entries[-1].verdict if self._entries else None
+
+    def score(self) -> dict[str, Any]:
+        """All throws so far in plain data: see `_row` for a throw; counts are of throws that are over."""
+        rows = [_row(entry, self._began) for entry in self._entries]
+        over = [row for row in rows if row["outcome"] != Outcome.ROLLING]
+        return {
+            "seed": self._seed,
+            "regime": self._regime,
+            "throws": rows,
+            "over": len(over),
+            "caught": sum(row["caught"] for row in over),
+            "reachable": sum(row["reachable"] for row in over),
+        }
+
+
+def _row(entry: _Entry, began: float) -> dict[str, Any]:
+    """One throw: lengths in mm where the key says so, else SI; durations count from its release, None: it did not happen."""
+    course, verdict = entry.course, entry.verdict
+    throw: Throw = course.throw
+    exit_state = course.exit_state
+    return {
+        "n": throw.n,
+        "speed": throw.speed,
+        "caught": course.outcome is Outcome.CAUGHT,
+        "outcome": str(course.outcome),
+        "miss_mm": _finite(1000.0 * course.miss),
+        "reachable": verdict.reachable,
+        "margin": _finite(verdict.margin),
+        "exit_y": exit_state.position[1] if exit_state else None,
+        "exit_speed": math.hypot(*exit_state.velocity) if exit_state else None,
+        "exit_after": _finite(course.exit_time),
+        "caught_after": _finite(course.caught_at),
+        "ended_after": _finite(course.ended_at),
+        "released_after": course.released_at - began,
+        "spin_share": throw.spin_share,
+        "rolling_resistance": throw.rolling_resistance,
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

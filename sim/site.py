@@ -1,0 +1,113 @@
+"""One laboratory site: the nominal cell, the arm and the drives' ratings, read from the files that services.toml names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from services.comm.directory import Directory
+from sim.drives import ratings
+from sim.puma_model import ArmModel, Frame3, Link, read_arm
+from sim.servo import DriveRating
+from sim.truth import LABORATORY_FILE, LaboratoryError, Truth, read_toml, read_truth
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """What the laboratory stands on. `laboratory` is the file of errors, regimes and disturbances."""
+
+    cell: Mapping[str, Any]
+    arm: ArmModel
+    drives: tuple[DriveRating, ...]
+    laboratory: Path = LABORATORY_FILE
+
+    def truth(self, regime: str) -> Truth:
+        """The truth in a regime. Raises LaboratoryError for a name that means nothing."""
+        return read_truth(self.cell, regime, self.laboratory)
+
+
+def read_site(cell_file: Path, laboratory: Path = LABORATORY_FILE) -> Site:
+    """Read the site from a file like services/cell.toml; the arm's file is named there, relative to it."""
+    cell = read_toml(cell_file)
+    try:
+        arm_file = cell_file.parent / cell["arm"]["model"]
+    except KeyError as fault:
+        raise LaboratoryError(
+            f"{cell_file}: [arm] model is missing; it names the arm's file, relative to this one"
+        ) from fault
+    arm = read_arm(arm_file)
+    try:
+        drives = ratings(read_toml(arm_file))
+    except KeyError as fault:
+        raise LaboratoryError(
+            f"{arm_file}: a [[joint]] lacks {fault}; drives need torque, speed and inertia"
+        ) from fault
+    return Site(cell, arm, drives, laboratory)
+
+
+def site_of(directory: Directory) -> Site:
+    """The site that services.toml names: `[parameters] cell`, and `laboratory` if it is not the shipped one."""
+    if "cell" not in directory.parameters:
+        raise LaboratoryError(f'{directory.source}: [parameters] cell is missing; write cell = "services/cell.toml"')
+    laboratory = directory.parameters.get("laboratory")
+    return read_site(
+        directory.file(directory.parameters["cell"]), directory.file(laboratory) if laboratory else LABORATORY_FILE
+    )
+
+
+class CupMount:
+    """Where the cup really is for encoder angles: the arm's flange and the true mount."""
+
+    def __init__(self, arm: ArmModel, truth: Truth) -> None:
+        self._arm = arm
+        self._zero: list[float] = truth.joint_zero.tolist()
+        axis, mouth = truth.cup.axis, truth.cup.mouth
+        self._z = _triple(axis)
+        aside = (0.0, 1.0, 0.0) if abs(axis[1]) < 0.9 else (1.0, 0.0, 0.0)
+        self._x = _unit(_cross(aside, self._z))
+        self._y = _cross(self._z, self._x)
+        self._mouth = _triple(mouth)
+        self._bottom = _triple(mouth - truth.cup.depth * axis)
+
+    def frame(self, q: list[float]) -> Frame3:
+        """The cup's frame at encoder angles (six, rad): origin in the middle of the mouth, z out of it."""
+        flange = self._arm.flange_frame(self._true(q))
+        at = flange.origin
+        x, y, z = (_minus(flange.point(axis), at) for axis in (self._x, self._y, self._z))
+        return Frame3(x, y, z, flange.point(self._mouth))
+
+    def solid_parts(self, q: list[float]) -> tuple[Any, Any]:
+        """Capsules of the arm at encoder angles: end points (6, 2, 3) and radii (6,), m, base frame."""
+        return self._arm.solid_parts(self._true(q), self._bottom)
+
+    def load(self, mass: float, radius: float, depth: float) -> Link:
+        """The cup as a body on the flange (kg, m): a thin tube around its axis."""
+        middle = tuple(0.5 * (m + b) for m, b in zip(self._mouth, self._bottom, strict=True))
+        along, across = mass * radius**2, mass * (0.5 * radius**2 + depth**2 / 12.0)
+        inertia = tuple(along * a * a + across * (1.0 - a * a) for a in self._z)
+        return Link(mass, (middle[0], middle[1], middle[2]), (inertia[0], inertia[1], inertia[2]))
+
+    def _true(self, q: list[float]) -> list[float]:
+        return [angle + zero for angle, zero in zip(q, self._zero, strict=True)]
+
+
+Triple = tuple[float, float, float]
+
+
+def _triple(v: Any) -> Triple:
+    return float(v[0]), float(v[1]), float(v[2])
+
+
+def _cross(a: Triple, b: Triple) -> Triple:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def _unit(a: Triple) -> Triple:
+    size = (a[0] ** 2 + a[1] ** 2 + a[2] ** 2) ** 0.5
+    return a[0] / size, a[1] / size, a[2] / size
+
+
+def _minus(a: Triple, b: Triple) -> Triple:
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]

@@ -1,0 +1,228 @@
+"""A laboratory on the bench: a small CANopen master of the tests' own that moves the arm, and a clairvoyant catcher."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from services.comm.canbus import Frame
+from services.comm.canopen import NmtCommand, Type, map_pdo, nmt, sdo_write_request
+from services.comm.channels import can_body, images_wanted, read_can
+from services.comm.cia402 import RECEIVED, SENT, Mode, Object, from_units, to_units
+from services.comm.messages import Call, Hello, Outcome
+from services.comm.party import TICK, Envelope
+from sim.laboratory import Laboratory
+from sim.puma_model import ArmModel
+from sim.site import Site, read_site
+
+REPOSITORY = Path(__file__).parents[2]
+CELL_FILE = REPOSITORY / "services" / "cell.toml"
+
+
+@pytest.fixture(scope="session")
+def site() -> Site:
+    """The shipped site."""
+    return read_site(CELL_FILE)
+
+
+@pytest.fixture(scope="session")
+def arm(site: Site) -> ArmModel:
+    """The shipped arm."""
+    return site.arm
+
+
+class Master:
+    """Sets six drives up over SDO, enables them, and leads them along straight joint paths at most of the joint limits."""
+
+    def __init__(self, model: ArmModel, pose: Sequence[float], share: float = 0.9) -> None:
+        self._speed, self._acceleration = share * model.speed, share * model.acceleration
+        self.target = np.array(pose, dtype=float)
+        self.position = np.array(pose, dtype=float)
+        self.status = [0] * 6
+        self.inputs = 0
+        self.emergencies: list[bytes] = []
+        self._path: Callable[[float], np.ndarray[Any, Any]] | None = None
+        self._began = 0.0
+        self._ends = 0.0
+        self._setup = self._setup_frames()
+        self._word = 0
+
+    @staticmethod
+    def _setup_frames() -> list[list[Frame]]:
+        groups = [[nmt(NmtCommand.ENTER_PREOPERATIONAL)]]
+        for node in range(1, 7):
+            transfers = map_pdo(Object.RPDO1, Object.RPDO1_MAPPING, 0x200 + node, 1, RECEIVED)
+            transfers += map_pdo(Object.TPDO1, Object.TPDO1_MAPPING, 0x180 + node, 1, SENT)
+            writes = [(t.index, t.sub, t.type.pack(t.value or 0)) for t in transfers]
+            writes.append((Object.MODE, 0, Type.INTEGER8.pack(Mode.CYCLIC_SYNCHRONOUS_POSITION)))
+            groups.append([sdo_write_request(node, *write) for write in writes])
+        return [*groups, [nmt(NmtCommand.START)]]
+
+    def frames(self, now: float) -> list[Frame]:
+        """Frames of this tick."""
+        if self._setup:
+            return self._setup.pop(0)
+        if self._path is not None:
+            self.target = self._path(now - self._began)
+        self._word = {0: 0x06, 0x06: 0x07}.get(self._word, 0x0F)
+        if all(word & 0x08 for word in self.status):
+            self._word = 0x80 if self._word != 0x80 else 0x06
+        pack = RECEIVED[0].type.pack, RECEIVED[1].type.pack
+        frames = [
+            Frame(0x200 + node, pack[0](self._word) + pack[1](to_units(self.target[node - 1]))) for node in range(1, 7)
+        ]
+        return [*frames, Frame(0x080, b"")]
+
+    def take(self, frames: Sequence[Frame]) -> None:
+        """Frames of drives and inputs."""
+        for frame in frames:
+            node = frame.id - 0x180
+            if 1 <= node <= 6:
+                self.status[node - 1] = Type.UNSIGNED16.unpack(frame.data[:2])
+                self.position[node - 1] = from_units(Type.INTEGER32.unpack(frame.data[2:6]))
+            elif node == 7:
+                self.inputs = frame.data[0]
+            elif 0x81 <= frame.id <= 0x87:
+                self.emergencies.append(frame.data)
+
+    @property
+    def enabled(self) -> bool:
+        """Whether all drives are in OPERATION ENABLED."""
+        return all(word & 0x6F == 0x27 for word in self.status)
+
+    def move(self, now: float, goal: Sequence[float]) -> float:
+        """Lead the arm to `goal` from where it is led now; gives the seconds that takes."""
+        begin, way = self.target.copy(), np.array(goal, dtype=float) - self.target
+        size = np.abs(way).clip(1e-9)
+        speed, acceleration = float((self._speed / size).min()), float((self._acceleration / size).min())
+        ramp = min(speed / acceleration, 1.0 / math.sqrt(acceleration))
+        duration = 1.0 / (acceleration * ramp) + ramp
+
+        def path(t: float) -> np.ndarray[Any, Any]:
+            t = min(max(t, 0.0), duration)
+            if t < ramp:
+                share = 0.5 * acceleration * t * t
+            elif t > duration - ramp:
+                share = 1.0 - 0.5 * acceleration * (duration - t) ** 2
+            else:
+                share = acceleration * ramp * (t - 0.5 * ramp)
+            return np.asarray(begin + share * way)
+
+        self._path, self._began, self._ends = path, now, now + duration
+        return duration
+
+    def arrived(self, now: float) -> bool:
+        """Whether the path is at its end."""
+        return now >= self._ends
+
+
+class Bench:
+    """A laboratory, its master, and a caller, tick by tick; envelopes take one tick each way."""
+
+    def __init__(self, site: Site, **options: Any) -> None:
+        self.lab = Laboratory("laboratory", site, {"arm": "motion", "camera": "vision"}.__getitem__, **options)
+        self.home: list[float] = site.arm.poses["home"].tolist()
+        self.master = Master(site.arm, self.home)
+        self.tick = 0
+        self.images: list[tuple[float, Any]] = []
+        self.answers: list[Outcome] = []
+        self._inbox: list[Envelope] = []
+        self._calls = 0
+        self.post("call", "coordinator", Hello(1, 99, "coordinator", "coordinator", "boot"))
+
+    @property
+    def now(self) -> float:
+        """Time of the next tick (s)."""
+        return self.tick * TICK
+
+    def post(self, channel: str, source: str, body: Any) -> None:
+        """Send an envelope to the laboratory."""
+        self._inbox.append(Envelope("laboratory", source, "laboratory", channel, body))
+
+    def want_images(self, rate: float) -> None:
+        """Ask for images."""
+        self.post("control", "camera", images_wanted(rate, 1))
+
+    def call(self, service: str, **arguments: Any) -> Outcome:
+        """Call a service and wait for its answer."""
+        self._calls += 1
+        self.post("call", "coordinator", Call(f"call-{self._calls}", service, arguments))
+        before = len(self.answers)
+        self.run(lambda: len(self.answers) > before, 0.1)
+        return self.answers[-1]
+
+    def step(self) -> None:
+        """One tick."""
+        now = self.now
+        self.post("can", "arm", can_body(self.master.frames(now)))
+        inbox, self._inbox = self._inbox, []
+        for envelope in inbox:
+            self.lab.receive(now, envelope)
+        self.lab.advance(now)
+        self.tick += 1
+        for envelope in self.lab.drain():
+            if envelope.channel == "can":
+                self.master.take(read_can(envelope.body))
+            elif envelope.channel == "image":
+                self.images.append((self.now, envelope.body))
+            elif isinstance(envelope.body, Outcome):
+                self.answers.append(envelope.body)
+
+    def run(self, until: Callable[[], bool], at_most: float) -> bool:
+        """Step until it holds, at most so many seconds; says whether it held."""
+        for _ in range(round(at_most / TICK)):
+            if until():
+                return True
+            self.step()
+        return until()
+
+    def wait(self, seconds: float) -> None:
+        """Step for so many seconds."""
+        self.run(lambda: False, seconds)
+
+    def enable(self) -> None:
+        """Set up and enable the drives."""
+        assert self.run(lambda: self.master.enabled, 1.0), self.master.status
+
+    def move(self, goal: Sequence[float]) -> None:
+        """Lead the arm somewhere and wait until it is there."""
+        self.wait(self.master.move(self.now, goal) + 0.1)
+
+    def catch_one(self) -> dict[str, Any]:
+        """One whole cycle of a clairvoyant catcher: it is told where the oracle would catch. Gives the throw's row."""
+        lab = self.lab
+        count = len(lab.referee.score()["throws"])
+        assert self.run(lambda: lab.world.course is not None, 3.0)
+        course, verdict = lab.world.course, lab.referee.last
+        assert course is not None and verdict is not None
+        if verdict.pose is not None:
+            self.master.move(self.now, verdict.pose.tolist())
+        self.run(lambda: lab.world.barrier or lab.world.course is None, 8.0)
+        turned = [
+            *self.master.target[:5].tolist(),
+            self.master.target[5] + math.copysign(math.pi, -self.master.target[5]),
+        ]
+        self.move(turned)
+        assert self.run(lambda: lab.world.course is None, 3.0), course
+        self.move(self.home)
+        row: dict[str, Any] = lab.referee.score()["throws"][count]
+        return row
+
+
+@pytest.fixture
+def bench(site: Site) -> Iterator[Callable[..., Bench]]:
+    """Makes benches; options as for Laboratory."""
+    made: list[Bench] = []
+
+    def make(**options: Any) -> Bench:
+        made.append(Bench(site, **options))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.lab.close()
