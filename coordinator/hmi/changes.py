@@ -1,0 +1,212 @@
+"""How changes alter a snapshot, and how those that a client has not got yet are merged into one; pure.
+
+`page/state.js` holds the same rules for browsers. A test applies random changes one by one and merged: same state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from copy import deepcopy
+from typing import Any
+
+Change = Mapping[str, Any]
+State = dict[str, Any]
+
+FIRINGS_KEPT = 60
+ENDED_KEPT = 200
+SAMPLES_KEPT = 300
+NOTICES_KEPT = 30
+PENDING_LIMIT = 400
+"""Entries that may wait for one client; one that is further behind gets a fresh snapshot instead."""
+
+
+def empty_state() -> State:
+    """A snapshot of nothing: no task, no run, nobody at the controls."""
+    return {
+        "sequence": 0,
+        "mission": {"id": "", "state": "idle", "mode": "realtime"},
+        "time": 0.0,
+        "task": None,
+        "marking": {},
+        "runs": {},
+        "ended": [],
+        "firings": [],
+        "nodes": {},
+        "events": {},
+        "variables": {},
+        "devices": {},
+        "images": {},
+        "setpoints": {},
+        "reports": {},
+        "notices": [],
+        "breakpoints": [],
+        "paused": None,
+        "controls": {"holder": None, "asking": []},
+        "selectors": {},
+        "result": None,
+    }
+
+
+def _append(state: State, key: str, entry: Any, kept: int) -> None:
+    entries = state[key]
+    entries.append(entry)
+    if len(entries) > kept:
+        del entries[: len(entries) - kept]
+
+
+def _ended(state: State, change: Change) -> None:
+    run = state["runs"].pop(change["id"], None)
+    if run is not None:
+        extra = {key: change[key] for key in ("status", "ended", "reason", "counts") if key in change}
+        _append(state, "ended", {**run, **extra}, ENDED_KEPT)
+
+
+def _progress(state: State, change: Change) -> None:
+    run = state["runs"].get(change["id"])
+    if run is not None:
+        state["runs"][change["id"]] = {**run, **{k: change[k] for k in ("progress", "state", "data") if k in change}}
+
+
+def _setpoint(state: State, change: Change) -> None:
+    known = state["setpoints"].get(change["stream"], {"samples": []})
+    samples = [*known["samples"], *change.get("samples", ())][-SAMPLES_KEPT:]
+    state["setpoints"][change["stream"]] = {**known, **change.get("setpoint", {}), "samples": samples}
+
+
+def _entry(table: str, field: str) -> Callable[[State, Change], None]:
+    def put(state: State, change: Change) -> None:
+        state[table][change["name"]] = change[field]
+
+    return put
+
+
+def _whole(key: str) -> Callable[[State, Change], None]:
+    def put(state: State, change: Change) -> None:
+        state[key] = change[key]
+
+    return put
+
+
+_RULES: dict[str, Callable[[State, Change], None]] = {
+    "mission": lambda s, c: s.update(mission={**s["mission"], **c["mission"]}),
+    "marking": lambda s, c: s["marking"].update(c["marking"]),
+    "fired": lambda s, c: _append(s, "firings", c["firing"], FIRINGS_KEPT),
+    "run_started": lambda s, c: s["runs"].update({c["run"]["id"]: c["run"]}),
+    "run_progress": _progress,
+    "run_ended": _ended,
+    "node": _entry("nodes", "node"),
+    "event": _entry("events", "event"),
+    "variable": _entry("variables", "value"),
+    "device": _entry("devices", "device"),
+    "image": _entry("images", "image"),
+    "report": _entry("reports", "report"),
+    "selector": _entry("selectors", "selector"),
+    "setpoint": _setpoint,
+    "notice": lambda s, c: _append(s, "notices", c["notice"], NOTICES_KEPT),
+    "breakpoints": _whole("breakpoints"),
+    "paused": _whole("paused"),
+    "controls": _whole("controls"),
+    "result": _whole("result"),
+}
+KINDS = frozenset(_RULES) | {"reset"}
+"""Kinds of change. `reset` says that so much is new (another mission) that clients get a snapshot instead."""
+
+_NAMED = frozenset({"node", "event", "variable", "device", "image", "report", "selector"})
+_WHOLE = frozenset({"breakpoints", "paused", "controls", "result"})
+
+
+def apply(state: State, change: Change) -> None:
+    """Alter a state by one change. Unknown kinds alter nothing but the number, so that old clients live with new servers."""
+    rule = _RULES.get(str(change["kind"]))
+    if rule is not None:
+        rule(state, change)
+    if "sequence" in change:
+        state["sequence"] = change["sequence"]
+    if "time" in change:
+        state["time"] = max(state["time"], change["time"])
+
+
+def copy_state(state: State) -> State:
+    """A state that later changes to the first do not reach."""
+    return deepcopy(state)
+
+
+class Pending:
+    """The one merged delta that waits for a client: newest value of what has a newest value, all of what must not be lost.
+
+    Its size is bounded: past `PENDING_LIMIT` entries, or after a `reset`, it holds nothing and says `stale`.
+    """
+
+    __slots__ = ("_entries", "_first", "_last", "_time", "stale")
+
+    def __init__(self) -> None:
+        self._entries: dict[tuple[str, Any], Change] = {}
+        self._first = 0
+        self._last = 0
+        self._time = 0.0
+        self.stale = False
+
+    def __bool__(self) -> bool:
+        return self.stale or self._last != 0
+
+    def add(self, change: Change) -> None:
+        """Take in the next change."""
+        self._first = self._first or change["sequence"]
+        self._last = change["sequence"]
+        self._time = change.get("time", self._time)
+        if self.stale:
+            return
+        kind = change["kind"]
+        if kind == "reset" or len(self._entries) >= PENDING_LIMIT:
+            self.stale = True
+            self._entries = {}
+            return
+        key = _key(kind, change)
+        before = self._entries.get(key)
+        self._entries[key] = change if before is None else _merge(before, change)
+
+    def take(self) -> dict[str, Any]:
+        """The merged delta {type, first, last, time, changes}; nothing is pending afterwards."""
+        delta = {
+            "type": "delta",
+            "first": self._first,
+            "last": self._last,
+            "time": self._time,
+            "changes": [_bare(change) for change in self._entries.values()],
+        }
+        self.clear()
+        return delta
+
+    def clear(self) -> None:
+        """Nothing is pending, as after a snapshot."""
+        self._entries = {}
+        self._first = self._last = 0
+        self.stale = False
+
+
+def _key(kind: str, change: Change) -> tuple[str, Any]:
+    if kind in _NAMED:
+        return kind, change["name"]
+    if kind == "run_progress":
+        return kind, change["id"]
+    if kind == "setpoint":
+        return kind, change["stream"]
+    if kind in _WHOLE or kind in ("marking", "mission"):
+        return kind, None
+    return kind, change["sequence"]
+
+
+def _merge(old: Change, new: Change) -> Change:
+    kind = new["kind"]
+    if kind in ("marking", "mission"):
+        return {**new, kind: {**old[kind], **new[kind]}}
+    if kind == "run_progress":
+        return {**old, **new}
+    if kind == "setpoint":
+        samples = [*old.get("samples", ()), *new.get("samples", ())][-SAMPLES_KEPT:]
+        return {**new, "setpoint": {**old.get("setpoint", {}), **new.get("setpoint", {})}, "samples": samples}
+    return new
+
+
+def _bare(change: Change) -> dict[str, Any]:
+    return {key: value for key, value in change.items() if key not in ("sequence", "time")}

@@ -1,0 +1,86 @@
+// A net view with what stands around it on every tab: zoom, search, error branches, minimap, the path of opened macros.
+
+import { fill, h, text, words } from "./dom.js";
+import { icon } from "./icons.js";
+import { Minimap } from "./minimap.js";
+import { NetView } from "./net_view.js";
+
+export const tool = (name, label, onclick, properties = {}) =>
+  h("button", { type: "button", class: "tool", "aria-label": label, title: label, onclick, ...properties }, icon(name));
+
+export class Canvas {
+  constructor(label, events = {}) {
+    this.drawing = h("div", { class: "drawing" });
+    this.path = h("nav", { class: "path", "aria-label": "Opened macro places" });
+    this.errors = h("button", { type: "button", class: "tool wide", "aria-pressed": "false", onclick: () => this.fold(!this.view.folded) }, icon("fold"), "Error branches");
+    this.query = h("input", { type: "search", placeholder: "Find", "aria-label": "Find a place or transition", oninput: () => this.find(), onkeydown: (e) => this.searchKey(e) });
+    this.hits = h("ul", { class: "hits", role: "listbox", "aria-label": "Found" });
+    this.bar = h("div", { class: "canvas-bar" },
+      h("div", { class: "group" }, tool("minus", "Zoom out", () => this.view.zoomBy(1 / 1.25)), tool("plus", "Zoom in", () => this.view.zoomBy(1.25)), tool("fit", "Show the whole net", () => this.view.fit())),
+      h("div", { class: "group" }, this.errors),
+      h("label", { class: "find" }, icon("search"), this.query, this.hits));
+    this.corner = h("div", { class: "corner" });
+    this.root = h("section", { class: "canvas", "aria-label": label }, this.drawing, this.bar, this.path, this.corner);
+    this.view = new NetView(this.drawing, label, { ...events, foldClicked: () => this.fold(false), moved: () => this.map?.follow() });
+    this.map = new Minimap(this.corner);
+  }
+
+  show(net) {
+    this.view.show(net);
+    this.errors.hidden = ![...this.view.elements.values()].some((e) => e.error);
+    this.map.draw(this.view);
+  }
+
+  fold(folded) {
+    this.view.fold(folded);
+    this.errors.setAttribute("aria-pressed", String(!folded));
+    this.map.draw(this.view);
+    this.folded?.(folded);
+  }
+
+  /** Show where we are: `names` from the task to the innermost opened macro; `go(index)` leads back. */
+  trail(names, go) {
+    this.path.hidden = names.length < 2;
+    fill(this.path, names.map((name, i) => h("button", { type: "button", disabled: i === names.length - 1, onclick: () => go(i) }, words(name))));
+  }
+
+  find() {
+    const wanted = this.query.value.trim().toLowerCase().replaceAll(" ", "_");
+    const all = [...this.view.elements.values()];
+    const found = wanted ? all.filter((e) => e.name.toLowerCase().includes(wanted) || (e.label ?? "").toLowerCase().includes(this.query.value.trim().toLowerCase())) : [];
+    this.view.only("hit", new Set(found.map((e) => e.name)));
+    fill(this.hits, found.slice(0, 9).map((e) =>
+      h("li", { role: "option", onpointerdown: (event) => { event.preventDefault(); this.goTo(e.name); } }, words(e.name), h("span", {}, e.shape === "place" ? e.kind : "transition"))));
+    this.found = found;
+  }
+
+  searchKey(event) {
+    if (event.key === "Enter" && this.found?.length) {
+      this.turn = ((this.turn ?? -1) + 1) % this.found.length;
+      this.goTo(this.found[this.turn].name);
+    } else if (event.key === "Escape") {
+      this.query.value = "";
+      this.find();
+      this.query.blur();
+    }
+    event.stopPropagation();
+  }
+
+  goTo(name) {
+    const element = this.view.elements.get(name);
+    if (!element) return false;
+    if (this.view.isFolded(element)) this.fold(false);
+    this.view.centre(name);
+    this.view.flash(element, false);
+    this.view.events.chosen?.(element, {});
+    return true;
+  }
+}
+
+/** A titled part of a side panel; `count` is shown beside the title. */
+export function panel(title, content, properties = {}) {
+  const count = h("span", { class: "count" });
+  const head = h("h2", {}, title, count);
+  const root = h("section", { class: "panel", "aria-label": title, ...properties }, head, content);
+  return { root, content, count: (value) => text(count, value ?? "") };
+}

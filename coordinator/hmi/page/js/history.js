@@ -1,0 +1,2 @@
+import { h } from "./dom.js";
+export class History { constructor() { this.root = h("div", {}); } follow() {} restart() {} }

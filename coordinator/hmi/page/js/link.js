@@ -1,0 +1,176 @@
+// The WebSocket to the coordinator: snapshot, numbered deltas merged once a frame, commands and their answers.
+
+import { apply, emptyState, PART } from "./state.js";
+
+const LOST_AFTER_MS = 3500;
+const RETRY_MS = [250, 500, 1000, 2000, 4000];
+const ANSWER_MS = 20000;
+
+/** A tab's secret: it stays the same operator after a refresh. */
+function tabSecret() {
+  let secret = sessionStorage.getItem("petrobot.tab");
+  if (!secret) {
+    secret = Array.from(crypto.getRandomValues(new Uint8Array(16)), (b) => b.toString(16).padStart(2, "0")).join("");
+    sessionStorage.setItem("petrobot.tab", secret);
+  }
+  return secret;
+}
+
+export class Link {
+  /** `painted(changed, changes)` is called at most once a frame with the set of altered parts. */
+  constructor(painted) {
+    this.state = emptyState();
+    this.connected = false;
+    this.gaps = 0;
+    this.deltas = 0;
+    this.lastPaint = 0;
+    this.receivedAt = 0;
+    this.painted = painted;
+    this.waiting = [];
+    this.changed = new Set();
+    this.frame = 0;
+    this.answers = new Map();
+    this.number = 0;
+    this.tries = 0;
+    this.heardAt = 0;
+    setInterval(() => this.watch(), 500);
+    document.addEventListener("visibilitychange", () => this.reschedule());
+    this.open();
+  }
+
+  open() {
+    const scheme = location.protocol === "https:" ? "wss" : "ws";
+    const socket = new WebSocket(`${scheme}://${location.host}/api/live`);
+    this.socket = socket;
+    this.heardAt = performance.now();
+    socket.onopen = () => {
+      const name = localStorage.getItem("petrobot.name") ?? "operator";
+      socket.send(JSON.stringify({ type: "hello", protocol: 1, name, tab: tabSecret() }));
+    };
+    socket.onmessage = (event) => this.hear(JSON.parse(event.data));
+    socket.onclose = () => this.lost(socket);
+  }
+
+  lost(socket) {
+    if (socket !== this.socket) return;
+    this.socket = null;
+    if (this.connected) {
+      this.connected = false;
+      this.note("connection");
+    }
+    for (const answer of this.answers.values()) answer({ ok: false, code: "lost", text: "the connection was lost" });
+    this.answers.clear();
+    setTimeout(() => this.open(), RETRY_MS[Math.min(this.tries++, RETRY_MS.length - 1)]);
+  }
+
+  watch() {
+    if (this.socket && performance.now() - this.heardAt > LOST_AFTER_MS) this.socket.close();
+    if (this.socket && performance.now() - this.heardAt > 2 * LOST_AFTER_MS) this.lost(this.socket);
+  }
+
+  hear(message) {
+    this.heardAt = performance.now();
+    if (message.type === "answer") {
+      this.answers.get(message.id)?.(message);
+      this.answers.delete(message.id);
+      return;
+    }
+    if (message.type === "alive") return;
+    this.waiting.push(message);
+    this.schedule();
+  }
+
+  note(part) {
+    this.changed.add(part);
+    this.schedule();
+  }
+
+  schedule() {
+    if (this.frame) return;
+    // a hidden window gets no frames; its messages must not pile up
+    this.hidden = document.hidden;
+    this.frame = this.hidden ? setTimeout(() => this.paint(), 400) : requestAnimationFrame(() => this.paint());
+  }
+
+  reschedule() {
+    if (!this.frame) return;
+    if (this.hidden) clearTimeout(this.frame);
+    else cancelAnimationFrame(this.frame);
+    this.frame = 0;
+    this.schedule();
+  }
+
+  paint() {
+    this.frame = 0;
+    const messages = this.waiting;
+    this.waiting = [];
+    const changes = [];
+    for (const message of messages) {
+      if (message.type === "snapshot") this.takeSnapshot(message, changes);
+      else if (message.type === "delta") this.takeDelta(message, changes);
+    }
+    const changed = this.changed;
+    this.changed = new Set();
+    this.painted(changed, changes);
+  }
+
+  takeSnapshot(message, changes) {
+    const { type, protocol, ...state } = message;
+    this.state = { ...emptyState(), ...state };
+    this.clock(this.state.time);
+    changes.length = 0;
+    this.changed.add("all");
+    this.tries = 0;
+    this.connected = true;
+    document.documentElement.dataset.sequence = String(this.state.sequence);
+  }
+
+  takeDelta(message, changes) {
+    if (message.first !== this.state.sequence + 1) {
+      this.gaps += 1;
+      this.socket?.send(JSON.stringify({ type: "resync" }));
+      return;
+    }
+    for (const change of message.changes) {
+      apply(this.state, change);
+      this.changed.add(PART[change.kind] ?? "unknown");
+      changes.push(change);
+    }
+    this.deltas += 1;
+    this.state.sequence = message.last;
+    this.clock(message.time);
+    document.documentElement.dataset.sequence = String(message.last);
+  }
+
+  clock(time) {
+    this.state.time = Math.max(time, 0);
+    this.receivedAt = performance.now();
+  }
+
+  /** The mission's clock now (s): it goes on between messages in real time, and only by messages in lock step. */
+  now() {
+    const { mission, time, paused } = this.state;
+    const goes = mission.mode === "realtime" && ["running", "stopping"].includes(mission.state) && !paused && this.connected;
+    return goes ? time + (performance.now() - this.receivedAt) / 1000 : time;
+  }
+
+  /** Send a command; resolves with the server's answer {ok, code, text, ...}. */
+  command(verb, data = {}) {
+    if (!this.connected || !this.socket) {
+      return Promise.resolve({ ok: false, code: "lost", text: "there is no connection to the coordinator" });
+    }
+    const id = ++this.number;
+    this.socket.send(JSON.stringify({ type: "command", id, verb, data }));
+    return new Promise((resolve) => {
+      this.answers.set(id, resolve);
+      setTimeout(() => {
+        if (this.answers.delete(id)) resolve({ ok: false, code: "silent", text: "the coordinator did not answer" });
+      }, ANSWER_MS);
+    });
+  }
+
+  get mayAct() {
+    const { controls, you } = this.state;
+    return this.connected && controls.holder === you;
+  }
+}

@@ -1,0 +1,378 @@
+// The live view: tokens on the net, what runs now and why, what fired and why it failed, and the operator's hand.
+
+import { Cameras, Devices } from "./camera.js";
+import { Canvas, panel } from "./canvas.js";
+import { Chart } from "./charts.js";
+import { attribute, fill, h, rows, seconds, text, words } from "./dom.js";
+import { icon } from "./icons.js";
+import { stateOf } from "./operator.js";
+import { Selected } from "./selected.js";
+import { sheetOf, tokensOf } from "./sheet.js";
+import { Timeline } from "./timeline.js";
+
+const FIRINGS_SHOWN = 25;
+const STATUS_ICON = { success: "check", failure: "warning", error: "error" };
+
+export class Live {
+  constructor(link, operator) {
+    Object.assign(this, { link, operator, inside: "" });
+    this.canvas = new Canvas("Task net", {
+      chosen: (element) => this.choose(element.name),
+      opened: (element) => element.kind === "macro" && this.open(element.name),
+      background: () => this.choose(null),
+    });
+    this.selected = new Selected(link, operator, (name) => this.open(name));
+    this.running = panel("Running now", h("ul", { class: "cards" }));
+    this.firings = panel("Last firings", h("ol", { class: "firings" }));
+    this.nodes = panel("Nodes", h("ul", { class: "nodes" }));
+    this.selectors = panel("Selectors", h("ul", { class: "selectors" }));
+    this.result = h("section", { class: "result", role: "status", hidden: true });
+    this.side = h("aside", { class: "side", "aria-label": "Mission details" }, this.result, this.selected.root, this.running.root, this.firings.root, this.selectors.root, this.nodes.root);
+    this.dock = new Dock(link, (place) => this.canvas.goTo(place));
+    this.notice = h("p", { class: "empty-net" }, "No task is loaded.");
+    this.canvas.root.append(this.notice);
+    this.root = h("div", { class: "live" }, h("div", { class: "stage" }, this.canvas.root, this.dock.root), this.side);
+    this.canvas.folded = () => this.paintMarks();
+  }
+
+  get view() {
+    return this.canvas.view;
+  }
+
+  choose(name) {
+    this.selected.choose(name);
+    this.view.only("chosen", new Set(name ? [name] : []));
+    this.view.focusable(name);
+    this.selected.update(this.link.state, this.link.now());
+  }
+
+  open(macro) {
+    this.inside = macro;
+    this.draw();
+    this.view.fit();
+  }
+
+  draw() {
+    const { task } = this.link.state;
+    this.notice.hidden = Boolean(task);
+    if (!task) return;
+    if (this.inside && !task.places.some((p) => p.name === this.inside)) this.inside = "";
+    this.canvas.show(sheetOf(task, this.inside));
+    const parts = this.inside ? this.inside.split(".") : [];
+    this.canvas.trail([task.name, ...parts], (i) => this.open(parts.slice(0, i).join(".")));
+    this.paintTokens();
+    this.paintRuns();
+    this.paintMarks();
+  }
+
+  /** Called at most once a frame with what has changed. */
+  paint(changed, changes) {
+    const all = changed.has("all");
+    if (all) {
+      this.view.flights.clear();
+      for (const element of this.view.elements.values()) element.incoming = 0;
+      const key = JSON.stringify(this.link.state.task);
+      const first = this.taskKey !== key;
+      this.taskKey = key;
+      this.draw();
+      if (first) this.view.fit();
+    }
+    for (const change of changes) if (change.kind === "fired") this.fired(change.firing);
+    if (all || changed.has("marking") || changed.has("firings")) this.paintTokens();
+    if (all || changed.has("runs")) this.paintRuns();
+    if (all || changed.has("firings") || changed.has("breakpoints") || changed.has("marking")) this.paintMarks();
+    if (all || changed.has("firings")) this.paintFirings();
+    if (all || changed.has("nodes")) this.paintNodes();
+    if (all || changed.has("selectors")) this.paintSelectors();
+    if (all || changed.has("result") || changed.has("mission")) this.paintResult();
+    this.view.flights.freeze(Boolean(this.link.state.paused));
+    if (all || ["marking", "runs", "breakpoints", "events", "controls", "firings", "connection"].some((p) => changed.has(p))) this.selected.update(this.link.state, this.link.now());
+    this.dock.paint(changed);
+  }
+
+  /** Called a few times a second for what moves with the clock. */
+  tick(now) {
+    this.paintClocks(now);
+    this.dock.tick(now);
+  }
+
+  fired(firing) {
+    const name = this.drawnAs(firing.transition);
+    if (name) this.view.fire(name, Boolean(firing.error));
+  }
+
+  drawnAs(name) {
+    return this.view.elements.has(name) ? name : null;
+  }
+
+  paintTokens() {
+    const { task, marking } = this.link.state;
+    if (!task) return;
+    const shown = task.places.some((p) => p.kind === "macro") ? tokensOf(task, marking) : marking;
+    for (const element of this.view.elements.values()) if (element.shape === "place") this.view.tokens(element.name, shown[element.name] ?? 0);
+  }
+
+  paintRuns() {
+    const { runs } = this.link.state;
+    const byPlace = new Map();
+    for (const run of Object.values(runs)) byPlace.set(run.place, run);
+    for (const element of this.view.elements.values()) if (element.kind === "action") this.view.run(element.name, byPlace.get(element.name));
+    const list = Object.values(runs);
+    this.running.count(list.length || "");
+    rows(this.running.content, list, (run) => run.id, (run) => this.runCard(run), (node, run) => this.updateCard(node, run));
+    if (!list.length) this.running.content.dataset.empty = "Nothing runs.";
+    else delete this.running.content.dataset.empty;
+  }
+
+  runCard(run) {
+    const node = h("li", { class: "card", onclick: () => this.canvas.goTo(this.drawnAs(run.place)) });
+    node.parts = { action: h("strong"), where: h("span", { class: "chip" }), why: h("p", { class: "why" }), bar: h("progress", { max: 1 }), time: h("span", { class: "number" }), state: h("span", { class: "muted" }) };
+    const { action, where, why, bar, time, state } = node.parts;
+    node.append(h("div", { class: "line" }, action, where), why, bar, h("div", { class: "line" }, state, time));
+    return node;
+  }
+
+  updateCard(node, run) {
+    node.run = run;
+    const { action, where, why, bar, state } = node.parts;
+    text(action, words(run.action));
+    text(where, run.node);
+    text(why, [run.primitive_task && run.primitive_task !== run.action ? `for ${words(run.primitive_task)}` : "", run.why].filter(Boolean).join(": "));
+    if (run.progress === undefined || run.progress === null) bar.removeAttribute("value");
+    else if (bar.value !== run.progress || !bar.hasAttribute("value")) bar.value = run.progress;
+    text(state, words(run.state ?? "running"));
+    attribute(node, "data-state", run.state ?? "running");
+    this.cardClock(node, this.link.now());
+  }
+
+  cardClock(node, now) {
+    const { run } = node;
+    const limit = run.deadline ? ` of ${seconds(run.deadline)}` : "";
+    text(node.parts.time, `${seconds(Math.max(0, now - run.started))}${limit}`);
+    attribute(node, "data-late", run.deadline && now - run.started > 0.8 * run.deadline ? "" : null);
+  }
+
+  paintClocks(now) {
+    for (const node of this.running.content.children) if (node.run) this.cardClock(node, now);
+  }
+
+  paintMarks() {
+    const { breakpoints, firings, marking, task } = this.link.state;
+    const stops = new Set(breakpoints.map((b) => b.replace(/^(places|transitions)\./, "")));
+    const failed = new Map();
+    for (const firing of firings.slice(-FIRINGS_SHOWN)) if (firing.error) failed.set(firing.transition, firing);
+    for (const element of this.view.elements.values()) {
+      this.view.mark(element.name, "breakpoint", stops.has(element.name) ? "breakpoint" : null, "Breakpoint");
+      const why = failed.get(element.name);
+      if (element.shape === "transition") this.view.mark(element.name, "reason", why ? "failed" : null, why ? reasonText(why) : "");
+    }
+    this.alarms(task, marking);
+  }
+
+  /** Folded error branches that hold a token, by the place they begin at. */
+  alarms(task, marking) {
+    if (!task) return;
+    const red = new Set();
+    const errorPlaces = new Set(task.places.filter((p) => p.error && marking[p.name]).map((p) => p.name));
+    if (errorPlaces.size) {
+      for (const arc of task.arcs) {
+        if (arc.direction !== "in" || arc.end !== "error") continue;
+        if (this.reaches(task, arc.transition, errorPlaces)) red.add(arc.place);
+      }
+    }
+    this.view.alarm(red);
+  }
+
+  reaches(task, transition, wanted) {
+    const seen = new Set();
+    const open = [transition];
+    const error = new Set(task.places.filter((p) => p.error).map((p) => p.name));
+    while (open.length) {
+      const t = open.pop();
+      for (const arc of task.arcs) {
+        if (arc.transition !== t || arc.direction !== "out" || seen.has(arc.place) || !error.has(arc.place)) continue;
+        if (wanted.has(arc.place)) return true;
+        seen.add(arc.place);
+        for (const next of task.arcs) if (next.direction === "in" && next.place === arc.place) open.push(next.transition);
+      }
+    }
+    return false;
+  }
+
+  paintFirings() {
+    const list = this.link.state.firings.slice(-FIRINGS_SHOWN).reverse();
+    this.firings.count(this.link.state.mission.firings ?? "");
+    rows(this.firings.content, list, (f) => f.number, (f) => this.firingRow(f));
+    if (!list.length) this.firings.content.dataset.empty = "Nothing has fired yet.";
+    else delete this.firings.content.dataset.empty;
+  }
+
+  firingRow(firing) {
+    const reason = reasonText(firing);
+    const what = firing.error ? "error" : firing.reason?.status === "failure" ? "failure" : "plain";
+    return h("li", { class: `firing ${what}` },
+      h("button", { type: "button", onclick: () => this.canvas.goTo(firing.transition) },
+        h("span", { class: "line" }, h("strong", {}, words(firing.transition)), h("span", { class: "number" }, seconds(firing.at))),
+        h("span", { class: "cause" }, firing.cause ?? ""),
+        reason ? h("span", { class: "reason" }, icon(firing.error ? "error" : "warning"), h("span", {}, reason)) : null));
+  }
+
+  paintNodes() {
+    const list = Object.entries(this.link.state.nodes);
+    this.nodes.count(list.length ? `${list.filter(([, n]) => n.state === "up").length} of ${list.length} up` : "");
+    rows(this.nodes.content, list, ([name]) => name, () => h("li", { class: "node" }, h("i", { class: "lamp" }), h("strong"), h("span", { class: "detail" }), h("span", { class: "number" })), (row, [name, node]) => {
+      attribute(row, "data-state", node.state);
+      const [, title, detail, number] = row.children;
+      text(title, name);
+      text(detail, node.state === "up" ? (node.held ? words(node.held) : "") : `${words(node.state)}${node.text ? `: ${node.text}` : ""}`);
+      text(number, node.round_trip !== undefined && node.state === "up" ? `${(node.round_trip * 1000).toFixed(1)} ms` : "");
+    });
+    if (!list.length) this.nodes.content.dataset.empty = "No node is known.";
+    else delete this.nodes.content.dataset.empty;
+  }
+
+  paintSelectors() {
+    const list = Object.entries(this.link.state.selectors).filter(([, sel]) => (sel.alternatives ?? []).length > 1);
+    this.selectors.root.hidden = !list.length;
+    fill(this.selectors.content, list.map(([name, sel]) => this.selectorRow(name, sel)));
+  }
+
+  selectorRow(name, selector) {
+    const choose = h("select", { "aria-label": `Alternative for ${words(name)}`, disabled: !this.link.mayAct, onchange: (e) => this.operator.give("override_selector", { primitive_task: name, action: e.target.value || null }) },
+      h("option", { value: "" }, "learned choice"), selector.alternatives.map((a) => h("option", { value: a.action }, words(a.action))));
+    choose.value = selector.override ?? "";
+    const bars = selector.alternatives.map((a) => h("li", {}, h("span", {}, words(a.action)), h("meter", { min: 0, max: 1, value: a.probability ?? 0 }), h("span", { class: "number" }, a.probability !== undefined ? `${Math.round(a.probability * 100)} %` : "")));
+    return h("li", { class: "selector" }, h("div", { class: "line" }, h("strong", {}, words(name)), choose), h("ul", { class: "bars" }, bars));
+  }
+
+  paintResult() {
+    const { result, mission } = this.link.state;
+    const over = ["success", "failure", "error", "aborted", "stopped"].includes(mission.state);
+    this.result.hidden = !over;
+    if (!over) return;
+    attribute(this.result, "data-state", mission.state);
+    const head = { success: "The task reached its final marking", failure: "The task ended in failure", error: "The task ended in error", aborted: "The task was aborted", stopped: "Emergency stop" }[mission.state];
+    const facts = Object.entries(result ?? {}).filter(([, v]) => ["number", "string", "boolean"].includes(typeof v)).slice(0, 8);
+    fill(this.result, h("h2", {}, icon(STATUS_ICON[mission.state] ?? "error"), head), mission.reason ? h("p", {}, mission.reason) : null,
+      facts.length ? h("dl", {}, facts.map(([k, v]) => h("div", {}, h("dt", {}, words(k)), h("dd", {}, typeof v === "number" ? +v.toPrecision(4) : String(v))))) : null);
+  }
+
+  controlsChanged() {
+    this.paintSelectors();
+    this.selected.update(this.link.state, this.link.now(), true);
+  }
+
+  get frozen() {
+    return stateOf(this.link.state) === "paused";
+  }
+}
+
+/** Why a firing came from a run that did not succeed, as one sentence. */
+export function reasonText(firing) {
+  const { reason } = firing;
+  if (!reason || (!reason.code && !reason.text)) return "";
+  const who = firing.action ? `${words(firing.action)}${firing.node ? ` on ${firing.node}` : ""}: ` : "";
+  const done = reason.executed && reason.executed !== "yes" ? ` (executed: ${reason.executed})` : "";
+  return `${who}${reason.text || words(reason.code)}${reason.code && reason.text ? ` [${reason.code}]` : ""}${done}`;
+}
+
+/** The lower part: timeline, set points, images, devices, learning, variables. */
+class Dock {
+  constructor(link, chosen) {
+    this.link = link;
+    this.timeline = new Timeline(chosen);
+    this.latency = new Chart("Age of the newest set point when it was used", "mission time (s)", "age (ms)");
+    this.cameras = new Cameras();
+    this.devices = new Devices();
+    this.learning = h("div", { class: "learning" });
+    this.charts = new Map();
+    this.table = h("div", { class: "variables" });
+    this.events = h("div", { class: "variables" });
+    const pages = { Timeline: this.timeline.root, "Set points": this.latency.root, Camera: this.cameras.root, Devices: this.devices.root, Learning: this.learning, Variables: this.table, Events: this.events };
+    this.pages = pages;
+    this.tabs = h("div", { class: "tabs", role: "tablist", "aria-label": "Details" }, Object.keys(pages).map((name) =>
+      h("button", { type: "button", role: "tab", id: `tab-${name.replace(" ", "-")}`, onclick: () => this.show(name), onkeydown: (e) => this.move(e) }, name)));
+    this.body = h("div", { class: "dock-body" }, Object.entries(pages).map(([name, page]) => h("div", { role: "tabpanel", "aria-labelledby": `tab-${name.replace(" ", "-")}`, hidden: true }, page)));
+    this.root = h("section", { class: "dock", "aria-label": "Details" }, this.tabs, this.body);
+    this.show("Timeline");
+  }
+
+  show(name) {
+    this.shown = name;
+    Object.keys(this.pages).forEach((key, i) => {
+      this.tabs.children[i].setAttribute("aria-selected", String(key === name));
+      this.tabs.children[i].tabIndex = key === name ? 0 : -1;
+      this.body.children[i].hidden = key !== name;
+    });
+    this.paint(new Set(["all"]));
+    this.tick(this.link.now());
+  }
+
+  move(event) {
+    const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+    if (!step) return;
+    const names = Object.keys(this.pages);
+    const next = names[(names.indexOf(this.shown) + step + names.length) % names.length];
+    this.show(next);
+    this.tabs.children[names.indexOf(next)].focus();
+  }
+
+  paint(changed) {
+    const { state } = this.link;
+    const dirty = (part) => changed.has("all") || changed.has(part);
+    if (this.shown === "Set points" && dirty("setpoints")) this.paintLatency(state.setpoints);
+    if (this.shown === "Camera" && dirty("images")) this.cameras.update(state.images);
+    if (this.shown === "Devices" && dirty("devices")) this.devices.update(state.devices);
+    if (this.shown === "Learning" && dirty("reports")) this.paintLearning(state.reports);
+    if (this.shown === "Variables" && dirty("variables")) this.paintTable(this.table, state.variables, "No variable is known.");
+    if (this.shown === "Events" && dirty("events")) this.paintEvents(state);
+  }
+
+  tick(now) {
+    if (this.shown !== "Timeline") return;
+    const { state } = this.link;
+    const key = `${now.toFixed(2)} ${state.sequence} ${document.documentElement.dataset.theme}`;
+    if (key === this.timelineKey) return;
+    this.timelineKey = key;
+    const lanes = (state.task?.places ?? []).filter((p) => p.kind === "action");
+    this.timeline.set(lanes, state.ended, Object.values(state.runs), now);
+  }
+
+  paintLatency(setpoints) {
+    const streams = Object.keys(setpoints);
+    const times = [...new Set(streams.flatMap((n) => setpoints[n].samples.map(([t]) => t)))].sort((a, b) => a - b);
+    const columns = streams.map((n) => {
+      const by = new Map(setpoints[n].samples);
+      return times.map((t) => (by.has(t) ? by.get(t) * 1000 : null));
+    });
+    this.latency.set(streams.length ? streams : ["no stream yet"], streams.length ? [times, ...columns] : [[0, 1], [null, null]]);
+  }
+
+  paintLearning(reports) {
+    const curves = Object.entries(reports).filter(([, r]) => r.kind === "curve");
+    const others = Object.entries(reports).filter(([, r]) => r.kind !== "curve");
+    for (const [name, report] of curves) {
+      if (!this.charts.has(name)) {
+        const chart = new Chart(report.title ?? words(name), report.x ?? "runs", report.y ?? "");
+        this.charts.set(name, chart);
+        this.learning.append(chart.root);
+      }
+      this.charts.get(name).set(report.series, report.columns);
+    }
+    if (!this.notes) this.learning.append((this.notes = h("div", { class: "notes" })));
+    fill(this.notes, others.map(([name, r]) => h("article", {}, h("h3", {}, r.title ?? words(name)), h("p", {}, r.text ?? ""))),
+      curves.length || others.length ? null : h("p", { class: "empty" }, "Nothing has been learned yet. Curves appear here when a run learns."));
+  }
+
+  paintTable(host, values, empty) {
+    const list = Object.entries(values);
+    if (!list.length) return fill(host, h("p", { class: "empty" }, empty));
+    return fill(host, h("table", {}, h("tbody", {}, list.map(([name, value]) => h("tr", {}, h("th", { scope: "row" }, name), h("td", {}, typeof value === "string" ? value : JSON.stringify(value)))))));
+  }
+
+  paintEvents(state) {
+    const list = Object.entries(state.events);
+    if (!list.length) return fill(this.events, h("p", { class: "empty" }, "This task declares no events."));
+    return fill(this.events, h("table", {}, h("tbody", {}, list.map(([name, e]) => h("tr", {}, h("th", { scope: "row" }, words(name)), h("td", {}, `${e.scope ?? "external"}, ${e.memory ?? "pulse"}`), h("td", {}, e.armed ? "set" : ""), h("td", {}, e.last !== undefined && e.last !== null ? `last at ${seconds(e.last)}` : "never came"), h("td", {}, e.count ? `${e.count} times` : ""))))));
+  }
+}

@@ -1,0 +1,96 @@
+// Puts the page together: header, tabs, theme, and one painter for all that the link brings.
+
+import { Canvas } from "./canvas.js";
+import { Designer } from "./designer.js";
+import { attribute, h, text } from "./dom.js";
+import { History } from "./history.js";
+import { icon } from "./icons.js";
+import { Link } from "./link.js";
+import { Live } from "./live.js";
+import { Banner, Operator } from "./operator.js";
+import { toast } from "./toast.js";
+
+const TICK_MS = 100;
+
+class App {
+  constructor(root) {
+    this.link = new Link((changed, changes) => this.paint(changed, changes));
+    this.operator = new Operator(this.link);
+    this.banner = new Banner();
+    this.tabs = { Live: new Live(this.link, this.operator), Design: new Designer(this.link, this.operator), History: new History(this.link, this.operator) };
+    this.lostNote = h("div", { class: "lost", role: "alert", hidden: true }, icon("link"), h("span", {}, "Connection to the coordinator lost. What you see is old. Trying again …"));
+    this.switch = h("nav", { class: "switch", role: "tablist", "aria-label": "Views" }, Object.keys(this.tabs).map((name) => h("button", { type: "button", role: "tab", onclick: () => this.show(name) }, name)));
+    this.theme = h("button", { type: "button", class: "tool", onclick: () => this.setTheme(this.dark ? "light" : "dark") });
+    this.wall = h("button", { type: "button", class: "tool", "aria-label": "Wall screen: larger type", title: "Wall screen: larger type", "aria-pressed": "false", onclick: () => this.setWall(!this.isWall) }, icon("wall"));
+    this.header = h("header", { class: "top" }, h("span", { class: "brand" }, mark(), "petrobot"), this.switch, this.banner.root, h("div", { class: "spacer" }), this.wall, this.theme, this.operator.estop);
+    this.stage = h("main", { class: "main" }, Object.values(this.tabs).map((tab) => tab.root));
+    root.append(this.header, this.lostNote, this.operator.bar, this.stage);
+    this.setTheme(localStorage.getItem("petrobot.theme") ?? (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light"));
+    this.setWall(localStorage.getItem("petrobot.wall") === "yes");
+    this.show(location.hash.slice(1) in this.tabs ? location.hash.slice(1) : "Live");
+    setInterval(() => this.tick(), TICK_MS);
+    addEventListener("hashchange", () => location.hash.slice(1) in this.tabs && this.show(location.hash.slice(1)));
+  }
+
+  get dark() {
+    return document.documentElement.dataset.theme === "dark";
+  }
+
+  setTheme(theme) {
+    document.documentElement.dataset.theme = theme;
+    localStorage.setItem("petrobot.theme", theme);
+    const label = theme === "dark" ? "Light colours" : "Dark colours";
+    attribute(this.theme, "aria-label", label);
+    attribute(this.theme, "title", label);
+    this.theme.replaceChildren(icon(theme === "dark" ? "sun" : "moon"));
+  }
+
+  get isWall() {
+    return document.documentElement.dataset.wall === "yes";
+  }
+
+  setWall(on) {
+    document.documentElement.dataset.wall = on ? "yes" : "no";
+    localStorage.setItem("petrobot.wall", on ? "yes" : "no");
+    attribute(this.wall, "aria-pressed", on);
+  }
+
+  show(name) {
+    this.shown = name;
+    Object.entries(this.tabs).forEach(([key, tab], i) => {
+      this.switch.children[i].setAttribute("aria-selected", String(key === name));
+      tab.root.hidden = key !== name;
+    });
+    document.documentElement.dataset.view = name.toLowerCase();
+    if (location.hash !== `#${name}`) history.replaceState(null, "", `#${name}`);
+    this.tabs[name].shown?.();
+  }
+
+  paint(changed, changes) {
+    const { state, connected } = this.link;
+    this.lostNote.hidden = connected || !this.everConnected;
+    this.everConnected ||= connected;
+    attribute(document.documentElement, "data-connected", connected ? "yes" : "no");
+    this.banner.update(state, this.link.now());
+    this.operator.update(state);
+    this.tabs.Live.paint(changed, changes);
+    if (["all", "controls", "connection", "mission"].some((p) => changed.has(p))) for (const tab of Object.values(this.tabs)) tab.controlsChanged?.();
+    for (const change of changes) if (change.kind === "notice") toast(change.notice.level, change.notice.text);
+    for (const change of changes) this.tabs.History.follow(change);
+    if (changed.has("all")) this.tabs.History.restart();
+  }
+
+  tick() {
+    const now = this.link.now();
+    text(this.banner.time, `${now.toFixed(1)} s`);
+    if (this.shown === "Live") this.tabs.Live.tick(now);
+  }
+}
+
+function mark() {
+  const node = icon("layout");
+  node.classList.add("mark");
+  return node;
+}
+
+window.petrobot = new App(document.getElementById("app"));

@@ -1,0 +1,145 @@
+// The operator's controls: mission commands, who holds the controls, and the emergency stop that is always there.
+
+import { attribute, fill, h, seconds, text, words } from "./dom.js";
+import { icon } from "./icons.js";
+import { toast } from "./toast.js";
+
+export const ESTOP_KEY = "F9";
+
+const DONE = {
+  start: "Started", pause: "Paused", resume: "Goes on", step: "One firing", abort: "Aborted", estop: "Emergency stop given",
+  add_tokens: "Token added", remove_tokens: "Token removed", raise_event: "Event raised", force_exit: "Exit forced",
+  take_controls: "You hold the controls", ask_controls: "Asked for the controls", release_controls: "Controls released",
+  override_selector: "Selector set", breakpoint: "Breakpoint set",
+};
+const STATE_WORD = {
+  idle: "Ready", preparing: "Preparing", running: "Running", stopping: "Stopping", paused: "Paused", success: "Success",
+  failure: "Failure", error: "Error", aborted: "Aborted", stopped: "Emergency stop",
+};
+const HELD_WORD = { held: "held", cannot_hold: "cannot hold", stopped: "stopped", lost: "no answer" };
+
+/** What a pause was answered by each node, for people. */
+export const heldWords = (nodes) => Object.entries(nodes ?? {}).map(([node, answer]) => `${node}: ${HELD_WORD[answer] ?? answer}`).join(", ");
+
+export const stateOf = (state) => (state.paused && ["running", "stopping"].includes(state.mission.state) ? "paused" : state.mission.state);
+export const stateWord = (state) => STATE_WORD[stateOf(state)] ?? words(stateOf(state));
+
+export class Operator {
+  constructor(link) {
+    this.link = link;
+    const button = (verb, name, label, extra = {}) =>
+      h("button", { type: "button", class: "command", onclick: () => this.give(verb, {}), ...extra }, icon(name), h("span", {}, label));
+    this.buttons = {
+      start: button("start", "play", "Start", { class: "command primary" }),
+      pause: button("pause", "pause", "Pause"),
+      step: button("step", "step", "Step"),
+      resume: button("resume", "resume", "Resume"),
+      abort: button("abort", "abort", "Abort", { class: "command danger", onclick: () => this.confirm(this.buttons.abort, "abort", "Abort the mission?") }),
+    };
+    this.controls = h("div", { class: "holder" });
+    this.answer = h("p", { class: "pause-note", role: "status" });
+    this.bar = h("div", { class: "operator", role: "toolbar", "aria-label": "Mission" }, Object.values(this.buttons), this.answer, this.controls);
+    this.estop = h("button", { type: "button", class: "estop", "aria-keyshortcuts": ESTOP_KEY, onclick: () => this.stopNow() },
+      icon("stop"), h("span", {}, "Emergency stop"), h("kbd", {}, ESTOP_KEY));
+    addEventListener("keydown", (event) => {
+      if (event.key !== ESTOP_KEY) return;
+      event.preventDefault();
+      if (!event.repeat) this.stopNow();
+    }, { capture: true });
+  }
+
+  /** Give a command and tell how it was answered. */
+  async give(verb, data, silent = false) {
+    const answer = await this.link.command(verb, data);
+    if (!answer.ok) toast("error", `${words(verb)}: ${answer.text ?? answer.code ?? "refused"}`);
+    else if (!silent) toast("ok", [DONE[verb] ?? words(verb), answer.text, verb === "pause" ? heldWords(answer.nodes) : ""].filter(Boolean).join(" · "));
+    return answer;
+  }
+
+  async stopNow() {
+    this.estop.classList.add("given");
+    setTimeout(() => this.estop.classList.remove("given"), 1500);
+    if (!this.link.connected) {
+      toast("error", "No connection to the coordinator: use the hardware's emergency stop.");
+      return;
+    }
+    await this.give("estop", {});
+  }
+
+  /** A second press within three seconds carries out what cannot be undone. */
+  confirm(button, verb, question) {
+    const label = button.querySelector("span");
+    if (button.dataset.asked) {
+      delete button.dataset.asked;
+      label.textContent = words(verb).replace(/^./, (c) => c.toUpperCase());
+      this.give(verb, {});
+      return;
+    }
+    const before = label.textContent;
+    button.dataset.asked = "yes";
+    label.textContent = question;
+    setTimeout(() => {
+      if (!button.dataset.asked) return;
+      delete button.dataset.asked;
+      label.textContent = before;
+    }, 3000);
+  }
+
+  update(state) {
+    const may = this.link.mayAct;
+    const now = stateOf(state);
+    const live = ["running", "paused", "stopping"].includes(now);
+    const set = { start: may && !live && now !== "preparing", pause: may && now === "running", step: may && now === "paused", resume: may && now === "paused", abort: may && (live || now === "preparing") };
+    for (const [verb, on] of Object.entries(set)) this.buttons[verb].disabled = !on;
+    const why = may ? "" : "Take the controls first";
+    for (const button of Object.values(this.buttons)) attribute(button, "title", button.disabled && why ? why : null);
+    this.estop.disabled = false;
+    this.showPause(state);
+    this.showHolder(state);
+  }
+
+  showPause(state) {
+    const { paused } = state;
+    const reason = paused?.reason ? `${paused.reason}. ` : "";
+    text(this.answer, paused ? `${reason}${heldWords(paused.nodes)}` : "");
+  }
+
+  showHolder(state) {
+    const { controls, you } = state;
+    const key = JSON.stringify([controls, you, this.link.connected]);
+    if (this.holderKey === key) return;
+    this.holderKey = key;
+    const mine = controls.holder === you;
+    const label = controls.holder === null ? "Nobody holds the controls" : mine ? "You hold the controls" : `${controls.holder} holds the controls`;
+    const asking = (controls.asking ?? []).filter((who) => who !== you);
+    const actions = [];
+    if (controls.holder === null) actions.push(this.small("Take controls", () => this.give("take_controls", {})));
+    else if (mine) {
+      for (const who of asking) actions.push(this.small(`Hand over to ${who}`, () => this.give("release_controls", { to: who })));
+      actions.push(this.small("Release", () => this.give("release_controls", {})));
+    } else if ((controls.asking ?? []).includes(you)) actions.push(h("span", { class: "muted" }, "asked"));
+    else actions.push(this.small("Ask for controls", () => this.give("ask_controls", {})));
+    fill(this.controls, h("span", { class: mine ? "mine" : "theirs" }, icon(mine ? "hand" : "eye"), label), actions);
+  }
+
+  small(label, onclick) {
+    return h("button", { type: "button", class: "small", onclick }, label);
+  }
+}
+
+/** The mission in one line: state, task, time. */
+export class Banner {
+  constructor() {
+    this.state = h("span", { class: "state" });
+    this.task = h("span", { class: "task-name" });
+    this.time = h("span", { class: "time" });
+    this.root = h("div", { class: "banner", role: "status", "aria-label": "Mission state" }, this.state, this.task, this.time);
+  }
+
+  update(state, now) {
+    attribute(this.root, "data-state", stateOf(state));
+    text(this.state, stateWord(state));
+    text(this.task, words(state.task?.name ?? "no task"));
+    text(this.time, seconds(now));
+  }
+}

@@ -1,0 +1,108 @@
+// What is known of the chosen place or transition, what it waits for, and what the operator may do with it.
+
+import { fill, h, seconds, words } from "./dom.js";
+import { icon } from "./icons.js";
+import { caption } from "./sheet.js";
+
+const action = (name, label, onclick, disabled, why) =>
+  h("button", { type: "button", class: "small", onclick, disabled, title: disabled ? why : null }, icon(name), label);
+
+export class Selected {
+  constructor(link, operator, open) {
+    Object.assign(this, { link, operator, open, name: null });
+    this.root = h("section", { class: "panel selected", "aria-label": "Selected", hidden: true });
+  }
+
+  choose(name) {
+    this.name = name;
+    this.key = "";
+  }
+
+  update(state, now) {
+    const place = state.task?.places.find((p) => p.name === this.name);
+    const transition = state.task?.transitions.find((t) => t.name === this.name);
+    this.root.hidden = !place && !transition;
+    if (this.root.hidden) return;
+    const run = place ? Object.values(state.runs).find((r) => r.place === this.name) : null;
+    const stop = state.breakpoints.includes(`${place ? "places" : "transitions"}.${this.name}`);
+    const key = JSON.stringify([this.name, state.marking[this.name], run?.id, run?.state, stop, this.link.mayAct, state.mission.state, transition && this.missing(state, transition), this.lastFiring(state)?.number]);
+    if (key === this.key) return;
+    this.key = key;
+    fill(this.root, place ? this.place(state, place, run, stop) : this.transition(state, transition, stop, now));
+  }
+
+  head(kind, name, label) {
+    return h("h2", {}, h("span", { class: "kind" }, kind), words(label || name));
+  }
+
+  stopButton(element, stop, may) {
+    const label = stop ? "Remove breakpoint" : "Set breakpoint";
+    return action("dot", label, () => this.operator.give("breakpoint", { element, on: !stop }), !may, "Take the controls first");
+  }
+
+  place(state, place, run, stop) {
+    const may = this.link.mayAct;
+    const tokens = state.marking[place.name] ?? 0;
+    const full = place.capacity !== null && place.capacity !== undefined && tokens >= place.capacity;
+    const facts = [["Tokens", place.capacity ? `${tokens} of ${place.capacity}` : tokens]];
+    if (place.primitive_task) facts.push(["Primitive task", words(place.primitive_task)]);
+    const primitive = state.task.primitive_tasks[place.primitive_task];
+    if (primitive?.goal) facts.push(["Goal", primitive.goal]);
+    if (primitive?.deadline) facts.push(["Deadline", seconds(primitive.deadline)]);
+    if (run) facts.push(["Action", `${words(run.action)} on ${run.node}`], ["Why this one", run.why || "the only alternative"]);
+    const give = (verb) => this.operator.give(verb, { place: place.name, count: 1 });
+    const why = may ? "" : "Take the controls first";
+    const buttons = [this.stopButton(`places.${place.name}`, stop, may)];
+    if (place.kind === "control") {
+      buttons.unshift(action("plus", "Add token", () => give("add_tokens"), !may || full, full ? "The place is full" : why),
+        action("minus", "Remove token", () => give("remove_tokens"), !may || tokens < 1, tokens < 1 ? "The place is empty" : why));
+    }
+    if (run) buttons.push(...this.exits(state, place, run, may));
+    if (place.kind === "macro") buttons.push(action("macro", "Open", () => this.open(place.name), false));
+    return [this.head(place.kind === "action" ? "Action place" : `${words(place.kind)} place`.replace(/^./, (c) => c.toUpperCase()), place.name, place.label), this.facts(facts), h("div", { class: "buttons" }, buttons)];
+  }
+
+  /** A button for each way out of a place whose run goes on. */
+  exits(state, place, run, may) {
+    return state.task.arcs.filter((a) => a.direction === "in" && a.place === place.name).map((a) =>
+      action("exit", `Force ${words(a.transition)}`, () => this.operator.give("force_exit", { run: run.id, transition: a.transition }), !may, "Take the controls first"));
+  }
+
+  transition(state, transition, stop) {
+    const may = this.link.mayAct;
+    const facts = [];
+    const text = caption(transition);
+    if (text) facts.push(["Fires on", text]);
+    facts.push(["Now", this.missing(state, transition) || "may fire"]);
+    const last = this.lastFiring(state);
+    if (last) facts.push(["Last fired", `at ${seconds(last.at)}: ${last.cause ?? ""}`]);
+    if (last?.reason?.text || last?.reason?.code) facts.push(["Reason", `${last.reason.text ?? ""}${last.reason.code ? ` [${last.reason.code}]` : ""}`]);
+    const buttons = [this.stopButton(`transitions.${transition.name}`, stop, may)];
+    for (const event of transition.events ?? []) {
+      if (event.scope === "internal") continue;
+      buttons.push(action("bolt", `Raise ${words(event.name)}`, () => this.operator.give("raise_event", { event: event.name }), !may, "Take the controls first"));
+    }
+    return [this.head("Transition", transition.name, transition.label), this.facts(facts), h("div", { class: "buttons" }, buttons)];
+  }
+
+  facts(list) {
+    return h("dl", {}, list.map(([name, value]) => h("div", {}, h("dt", {}, name), h("dd", {}, String(value)))));
+  }
+
+  lastFiring(state) {
+    return state.firings.findLast((f) => f.transition === this.name);
+  }
+
+  /** What keeps a transition from firing, in words. */
+  missing(state, transition) {
+    const waits = [];
+    for (const arc of state.task.arcs.filter((a) => a.transition === transition.name)) {
+      const tokens = state.marking[arc.place] ?? 0;
+      if (arc.direction === "in" && tokens < arc.weight) waits.push(`a token in ${words(arc.place)}`);
+      else if (arc.direction === "in" && ["normal", "error"].includes(arc.end)) waits.push(`${words(arc.place)} to end${arc.end === "error" ? " in error" : ""}`);
+      else if (arc.direction === "inhibit" && tokens >= arc.weight) waits.push(`${words(arc.place)} to empty`);
+    }
+    for (const event of transition.events ?? []) if (!state.events[event.name]?.armed) waits.push(`the event ${words(event.name)}`);
+    return waits.length ? `waits for ${waits.join(", ")}` : "";
+  }
+}

@@ -1,0 +1,53 @@
+// Which part of a task is drawn: the whole with its macro places closed, or the inside of one macro place.
+
+import { placed } from "./layout.js";
+import { seconds, words } from "./dom.js";
+
+/** What stands above a transition: its events, condition and timer. */
+export function caption(transition) {
+  const parts = (transition.events ?? []).map((e) => `${e.scope === "internal" ? "int" : "ext"}: ${words(e.name)}`);
+  if (transition.after !== null && transition.after !== undefined) parts.push(`after ${seconds(transition.after)}`);
+  if (transition.when) parts.push(`[${transition.when}]`);
+  return parts.join(" · ");
+}
+
+const hintPlace = (p) => [p.name, p.primitive_task && `primitive task ${p.primitive_task}`, p.capacity && `capacity ${p.capacity}`].filter(Boolean).join("\n");
+const hintTransition = (t) => [t.name, caption(t), t.priority ? `priority ${t.priority}` : ""].filter(Boolean).join("\n");
+
+/** The net {places, transitions, arcs} of one sheet; `inside` is the name of a macro place, "" for the whole. */
+export function sheetOf(task, inside) {
+  const macros = new Set(task.places.filter((p) => p.kind === "macro").map((p) => p.name));
+  const shownAs = (name) => {
+    // the outermost macro place that closes over an element on this sheet
+    const prefix = inside ? inside.length + 1 : 0;
+    const rest = name.slice(prefix).split(".");
+    for (let n = 1; n < rest.length; n++) {
+      const macro = name.slice(0, prefix) + rest.slice(0, n).join(".");
+      if (macros.has(macro)) return macro;
+    }
+    return name;
+  };
+  const here = (e) => (e.in_macro ?? "") === inside;
+  const transitions = task.transitions.filter(here);
+  const names = new Set(transitions.map((t) => t.name));
+  const arcs = task.arcs.filter((a) => names.has(a.transition)).map((a) => ({ ...a, place: shownAs(a.place) }));
+  const places = task.places.filter(here);
+  const known = new Set(places.map((p) => p.name));
+  const base = (e) => (e.label ? e : { ...e, label: e.name.slice(inside ? inside.length + 1 : 0) });
+  return placed({
+    places: places.map((p) => base({ ...p, sub: p.kind === "action" && p.primitive_task !== p.name ? words(p.primitive_task) : "", hint: hintPlace(p) })),
+    transitions: transitions.map((t) => base({ ...t, sub: caption(t), hint: hintTransition(t) })),
+    arcs: arcs.filter((a) => known.has(a.place)),
+  });
+}
+
+/** Tokens of what is drawn: a macro place shows all that its inside holds. */
+export function tokensOf(task, marking) {
+  const shown = { ...marking };
+  for (const place of task.places) {
+    if (place.kind !== "macro") continue;
+    const prefix = `${place.name}.`;
+    shown[place.name] = Object.entries(marking).reduce((sum, [name, n]) => sum + (name.startsWith(prefix) ? n : 0), 0);
+  }
+  return shown;
+}

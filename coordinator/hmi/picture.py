@@ -1,0 +1,101 @@
+"""A task as the page draws it: plain data of places, transitions and arcs with all that they mean; pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from coordinator.task import Event, Kind, Place, PrimitiveTask, Reference, Scope, Task, Transition
+
+
+def picture(task: Task) -> dict[str, Any]:
+    """The snapshot's `task`: the flat net (its names are those of markings and firings) and the macro places above it."""
+    flat = task.flat
+    errors = flat.error_elements
+    macros = dict(_macros(task, task.places, ""))
+    return {
+        "name": task.name,
+        "text": task.text,
+        "goal": task.goal,
+        "runs_place": task.runs_place,
+        "parameters": dict(task.parameters),
+        "primitive_tasks": {name: _primitive_task(p) for name, p in task.primitive_tasks.items()},
+        "events": {name: _event(e) for name, e in task.events.items()},
+        "places": [
+            *(_place(p, p.name in errors) for p in flat.places.values()),
+            *({**_place(p, False), "name": name, "in_macro": name.rpartition(".")[0]} for name, p in macros.items()),
+        ],
+        "transitions": [_transition(t, flat, t.name in errors) for t in flat.transitions.values()],
+        "arcs": [arc for t in flat.transitions.values() for arc in _arcs(t)],
+    }
+
+
+def _macros(task: Task, places: Mapping[str, Place], prefix: str) -> Iterator[tuple[str, Place]]:
+    for place in places.values():
+        if place.kind is Kind.MACRO:
+            yield prefix + place.name, place
+            yield from _macros(task, task.subnets[place.subnet].places, f"{prefix}{place.name}.")
+
+
+def _place(place: Place, error: bool) -> dict[str, Any]:
+    return {
+        "name": place.name,
+        "kind": place.kind.value,
+        "label": place.label,
+        "in_macro": place.name.rpartition(".")[0],
+        "x": place.x,
+        "y": place.y,
+        "tokens": place.tokens,
+        "capacity": place.capacity,
+        "servers": place.servers,
+        "primitive_task": place.task,
+        "subnet": place.subnet,
+        "args": {k: f"${v.variable}" if isinstance(v, Reference) else v for k, v in place.args.items()},
+        "error": error,
+    }
+
+
+def _transition(transition: Transition, task: Task, error: bool) -> dict[str, Any]:
+    return {
+        "name": transition.name,
+        "label": transition.label,
+        "in_macro": transition.name.rpartition(".")[0],
+        "x": transition.x,
+        "y": transition.y,
+        "events": [_event_words(e, task) for e in transition.events],
+        "when": str(transition.when) if transition.when is not None else "",
+        "priority": transition.priority,
+        "weight": transition.weight,
+        "after": transition.after,
+        "error": error,
+    }
+
+
+def _event_words(name: str, task: Task) -> dict[str, str]:
+    event = task.events.get(name)
+    return {"name": name, "scope": event.scope.value if event else Scope.EXTERNAL.value}
+
+
+def _arcs(transition: Transition) -> Iterator[dict[str, Any]]:
+    for arc in transition.inputs:
+        ends = {"end": arc.end.value if arc.end else None, "counts": arc.counts.value if arc.counts else None}
+        yield {"place": arc.place, "transition": transition.name, "direction": "in", "weight": arc.weight, **ends}
+    for out in transition.outputs:
+        yield {"place": out.place, "transition": transition.name, "direction": "out", "weight": out.weight}
+    for stop in transition.inhibitors:
+        yield {"place": stop.place, "transition": transition.name, "direction": "inhibit", "weight": stop.threshold}
+
+
+def _primitive_task(task: PrimitiveTask) -> dict[str, Any]:
+    return {
+        "goal": task.goal,
+        "specification": task.specification,
+        "alternatives": list(task.alternatives),
+        "deadline": task.deadline,
+        "target_reliability": task.target_reliability,
+        "error_causes": dict(task.error_causes),
+    }
+
+
+def _event(event: Event) -> dict[str, Any]:
+    return {"scope": event.scope.value, "memory": event.memory.value, "by": event.by, "text": event.text}

@@ -1,0 +1,91 @@
+"""What the page needs of a mission: a snapshot, its numbered changes, and commands; all plain data.
+
+The shapes are written out in docs/operator-protocol.md, which is also what browsers and the command line speak.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+
+PROTOCOL = 1
+"""Version of docs/operator-protocol.md, in every snapshot."""
+
+VERBS = frozenset(
+    {
+        "start",
+        "pause",
+        "resume",
+        "step",
+        "breakpoint",
+        "add_tokens",
+        "remove_tokens",
+        "raise_event",
+        "force_exit",
+        "abort",
+        "estop",
+        "take_controls",
+        "ask_controls",
+        "release_controls",
+        "override_selector",
+    }
+)
+"""All commands. Anybody may say `estop`, `take_controls`, `ask_controls` and `release_controls` (a no-op for one who
+does not hold them); the others are for the holder of the controls."""
+
+SNAPSHOT_KEYS = (
+    "mission",
+    "time",
+    "task",
+    "marking",
+    "runs",
+    "ended",
+    "firings",
+    "nodes",
+    "events",
+    "variables",
+    "devices",
+    "images",
+    "setpoints",
+    "reports",
+    "notices",
+    "breakpoints",
+    "paused",
+    "controls",
+    "selectors",
+    "result",
+)
+"""What a snapshot holds besides `sequence`; `coordinator.hmi.changes.empty_state` gives each its empty value."""
+
+
+class MissionPort(Protocol):
+    """A mission as the page sees it. All methods are called in the coordinator's own loop and give plain JSON data."""
+
+    def snapshot(self) -> dict[str, Any]:
+        """The whole state now, with `sequence`, the number of the last change in it."""
+
+    def subscribe(self, receive: Callable[[dict[str, Any]], None]) -> Callable[[], None]:
+        """Give every later change to `receive`, numbered without gaps; call what is returned to stop.
+
+        `receive` never blocks and never raises. A change must not be altered after it was given out.
+        """
+
+    async def command(self, who: str, verb: str, data: Mapping[str, Any]) -> dict[str, Any]:
+        """Carry out a command; answers after it is journaled: {"ok": True, ...} or {"ok": False, "code", "text"}."""
+
+
+class HistoryPort(Protocol):
+    """Where the page finds finished and running journals."""
+
+    async def runs(self) -> Sequence[Mapping[str, Any]]:
+        """Every run, newest first: {id, task, state, started (ISO 8601 text), seconds, records}."""
+
+    async def open(self, run: str) -> Mapping[str, Any]:
+        """One run: {id, task (as in a snapshot), initial (marking), records: [record, ...]}. Raises KeyError."""
+
+
+class OffersPort(Protocol):
+    """What the nodes offer now, for the designer."""
+
+    def __call__(self) -> Sequence[Mapping[str, Any]]:
+        """One entry for each action: {action, primitive_task, node, device, args ({name: default}), up}."""

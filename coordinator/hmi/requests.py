@@ -1,0 +1,39 @@
+"""Reading JSON bodies and answering in JSON, the same for all handlers."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from aiohttp import web
+
+BODY_S = 10.0
+LARGEST_BODY = 2 * 1024 * 1024
+
+
+async def read_object(request: web.Request) -> dict[str, Any]:
+    """The JSON object in the body. Raises the HTTP answer that says what is wrong with it."""
+    try:
+        async with asyncio.timeout(BODY_S):
+            text = await request.text()
+    except TimeoutError:
+        raise web.HTTPRequestTimeout(text="the body did not arrive") from None
+    except UnicodeDecodeError:
+        raise web.HTTPBadRequest(text="the body is not UTF-8 text") from None
+    try:
+        value = json.loads(text)
+    except (ValueError, RecursionError):
+        raise web.HTTPBadRequest(text="the body is not JSON") from None
+    if not isinstance(value, dict):
+        raise web.HTTPBadRequest(text="send one JSON object")
+    return value
+
+
+def json_answer(value: Mapping[str, Any] | Sequence[Any], status: int = 200) -> web.Response:
+    """An answer that no cache keeps."""
+    text = json.dumps(value, default=str, ensure_ascii=False)
+    return web.Response(
+        text=text, status=status, content_type="application/json", headers={"Cache-Control": "no-store"}
+    )

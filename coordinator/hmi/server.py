@@ -1,0 +1,117 @@
+"""Serves the operator's page in the coordinator's own loop: files, task documents, history, and one WebSocket a client."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+import socket as sockets
+import ssl
+from collections.abc import Sequence
+from pathlib import Path
+
+from aiohttp import web
+
+from coordinator.hmi import documents, feeds
+from coordinator.hmi.doors import Doors, Handler, middleware, names_for
+from coordinator.hmi.gate import Gate
+from coordinator.hmi.house import HOUSE, House
+from coordinator.hmi.port import HistoryPort, MissionPort, OffersPort
+from coordinator.hmi.requests import LARGEST_BODY
+from coordinator.hmi.store import TaskStore
+
+PAGE_FILES = Path(__file__).parent / "page"
+
+
+class Page:
+    """A running page: `url` holds the token; `await close()` ends it."""
+
+    def __init__(self, runner: web.AppRunner, listening: asyncio.Server, house: House, url: str) -> None:
+        self._runner = runner
+        self._listening = listening
+        self._house = house
+        self.url = url
+        self.token = house.doors.token
+
+    @property
+    def clients(self) -> int:
+        """How many clients are connected."""
+        return len(self._house.sessions)
+
+    async def close(self) -> None:
+        """Close all connections and the port; commands that are being carried out are given up."""
+        self._listening.close()
+        self._house.closing = True
+        await self._runner.cleanup()
+        for task in list(self._house.commands):
+            task.cancel()
+        await asyncio.gather(*self._house.commands, return_exceptions=True)
+
+
+async def start_page(
+    port_object: MissionPort,
+    *,
+    tasks_folder: Path,
+    host: str = "127.0.0.1",
+    port: int = 0,
+    token: str | None = None,
+    offers: OffersPort | None = None,
+    history: HistoryPort | None = None,
+    names: Sequence[str] = (),
+    tls: ssl.SSLContext | None = None,
+) -> Page:
+    """Serve the page of a mission.
+
+    `port` 0 takes a free one. `names` are further names under which browsers ask for this server (needed when `host` is
+    not loopback). `token` is drawn anew unless given. Raises OSError when the address cannot be bound.
+    """
+    listener = _listen(host, port)
+    number = listener.getsockname()[1]
+    doors = Doors(token or secrets.token_urlsafe(24), number, names_for(host, names), tls is not None)
+    house = House(port_object, TaskStore(tasks_folder), doors, offers, history)
+    runner = web.AppRunner(_application(house), access_log=None, keepalive_timeout=30.0, shutdown_timeout=2.0)
+    await runner.setup()
+    assert runner.server is not None
+    house.gate = Gate(runner.server)
+    listening = await asyncio.get_running_loop().create_server(house.gate, sock=listener, ssl=tls, backlog=128)
+    shown = "127.0.0.1" if host in ("0.0.0.0", "::", "localhost") else f"[{host}]" if ":" in host else host
+    return Page(runner, listening, house, f"{'https' if tls else 'http'}://{shown}:{number}/?token={doors.token}")
+
+
+def _listen(host: str, port: int) -> sockets.socket:
+    family, kind, protocol, _, address = sockets.getaddrinfo(
+        host, port, type=sockets.SOCK_STREAM, flags=sockets.AI_PASSIVE
+    )[0]
+    listener = sockets.socket(family, kind, protocol)
+    try:
+        listener.setsockopt(sockets.SOL_SOCKET, sockets.SO_REUSEADDR, 1)
+        listener.bind(address)
+        listener.setblocking(False)
+    except OSError:
+        listener.close()
+        raise
+    return listener
+
+
+def _application(house: House) -> web.Application:
+    @web.middleware
+    async def count(request: web.Request, handler: Handler) -> web.StreamResponse:
+        if house.gate is not None:
+            house.gate.asked(request)
+        return await handler(request)
+
+    app = web.Application(middlewares=[count, middleware(house.doors)], client_max_size=LARGEST_BODY)
+    app[HOUSE] = house
+    app.router.add_get("/", _index)
+    app.router.add_static("/page", PAGE_FILES, follow_symlinks=False)
+    feeds.add_routes(app)
+    documents.add_routes(app)
+    return app
+
+
+async def _index(request: web.Request) -> web.StreamResponse:
+    doors = request.app[HOUSE].doors
+    if "token" in request.query:
+        away = web.HTTPSeeOther("/")  # the token leaves the address bar and the history of the browser
+        doors.hand_out(away)
+        raise away
+    return web.FileResponse(PAGE_FILES / "index.html", headers={"Cache-Control": "no-store"})

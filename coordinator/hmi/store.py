@@ -1,0 +1,129 @@
+"""The folder of task files: names, texts, revisions; a save that would undo another's is refused with both versions."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import re
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from coordinator.hmi.edits import EditError, Rename, edited, parse
+
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,63}")
+LARGEST_FILE = 1024 * 1024
+
+
+class StoreError(Exception):
+    """A task file cannot be read or written; `status` is the HTTP status to answer with."""
+
+    def __init__(self, status: int, text: str) -> None:
+        super().__init__(text)
+        self.status = status
+
+
+class Conflict(Exception):  # noqa: N818 - no fault: two people edited the same file
+    """The file is no longer what the edit began from."""
+
+    def __init__(self, theirs: TaskText, yours: str) -> None:
+        super().__init__(f"{theirs.name} was changed by somebody else since you opened it")
+        self.theirs = theirs
+        self.yours = yours
+
+
+@dataclass(frozen=True, slots=True)
+class TaskText:
+    """One task file as it stands on disk."""
+
+    name: str
+    text: str
+
+    @property
+    def revision(self) -> str:
+        """Changes exactly when the text does."""
+        return hashlib.sha256(self.text.encode()).hexdigest()[:16]
+
+
+class TaskStore:
+    """Task files of one folder, by bare name."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def names(self) -> list[str]:
+        """All task files."""
+        return sorted(p.stem for p in self._folder.glob("*.toml") if _NAME.fullmatch(p.stem))
+
+    def read(self, name: str) -> TaskText:
+        """One task file. Raises StoreError."""
+        path = self._path(name)
+        try:
+            if path.stat().st_size > LARGEST_FILE:
+                raise StoreError(413, f"{name}.toml is larger than {LARGEST_FILE} bytes")
+            return TaskText(name, path.read_bytes().decode("utf-8"))
+        except FileNotFoundError:
+            raise StoreError(404, f"no task file {name}.toml") from None
+        except (OSError, UnicodeDecodeError) as fault:
+            raise StoreError(400, f"{name}.toml cannot be read: {fault}") from fault
+
+    def save(self, name: str, base: str | None, document: dict[str, object], renames: list[Rename]) -> TaskText:
+        """Write an edited document; `base` is the revision that the edit began from, None for a new file.
+
+        Only what differs from the file's own values is altered in its text. Raises Conflict, StoreError.
+        """
+        try:
+            current: TaskText | None = self.read(name)
+        except StoreError as fault:
+            if fault.status != 404:
+                raise
+            current = None
+        yours = self.edited_text(current, document, renames)
+        if (current.revision if current else None) != base:
+            raise Conflict(current or TaskText(name, ""), yours)
+        self._write(name, yours)
+        return TaskText(name, yours)
+
+    def save_text(self, name: str, base: str | None, text: str) -> TaskText:
+        """Write a whole text, as after a conflict was settled by hand. Raises Conflict, StoreError."""
+        try:
+            parse(text)
+            current = self.read(name) if name in self.names() else None
+        except EditError as fault:
+            raise StoreError(400, str(fault)) from fault
+        if (current.revision if current else None) != base:
+            raise Conflict(current or TaskText(name, ""), text)
+        self._write(name, text)
+        return TaskText(name, text)
+
+    def edited_text(self, current: TaskText | None, document: dict[str, object], renames: list[Rename]) -> str:
+        """What the file would become. Raises StoreError."""
+        try:
+            return edited(current.text if current else "", document, renames)
+        except EditError as fault:
+            raise StoreError(400, str(fault)) from fault
+
+    def _path(self, name: str) -> Path:
+        if not _NAME.fullmatch(name):
+            raise StoreError(400, "a task's name has letters, digits, _ and - only, 64 at most")
+        return self._folder / f"{name}.toml"
+
+    def _write(self, name: str, text: str) -> None:
+        path = self._path(name)
+        if len(text.encode()) > LARGEST_FILE:
+            raise StoreError(413, f"{name}.toml would be larger than {LARGEST_FILE} bytes")
+        temporary = ""
+        try:
+            with tempfile.NamedTemporaryFile(dir=self._folder, prefix=f".{name}.", delete=False) as file:
+                temporary = file.name
+                file.write(text.encode())
+                file.flush()
+                os.fsync(file.fileno())
+            if path.exists():
+                os.chmod(temporary, path.stat().st_mode & 0o777)  # noqa: PTH101
+            Path(temporary).replace(path)
+        except OSError as fault:
+            with contextlib.suppress(OSError):
+                Path(temporary).unlink(missing_ok=True)
+            raise StoreError(400, f"{name}.toml cannot be written: {fault}") from fault
