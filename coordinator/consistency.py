@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
+from math import isfinite
 
 from coordinator.conditions import Expression
 from coordinator.regions import Domain, kind_faults
@@ -87,6 +88,9 @@ def _names(task: Task) -> Iterator[Fault]:
                 yield Fault(
                     f"{group}.{name}", f"{name!r} is no name", "use letters, digits and _, and no reserved word"
                 )
+    for name, value in task.parameters.items():
+        if not is_plain(value):
+            yield Fault(f"task.parameters.{name}", f"{value!r} is no default value", "use a finite number, text, ...")
     for name in set(task.variables) & set(task.parameters):
         yield Fault(f"variables.{name}", "a parameter has this name too", "rename one of them")
     for name in set(task.places) & set(task.transitions):
@@ -192,7 +196,9 @@ def _action_place(task: Task, key: str, p: Place) -> Iterator[Fault]:
                 yield Fault(f"{key}.args.{name}", f"{value.variable!r} is no variable and no parameter", remedy)
         elif not is_plain(value):
             yield Fault(
-                f"{key}.args.{name}", f"{value!r} is no plain value", "use numbers, texts, booleans, lists, tables"
+                f"{key}.args.{name}",
+                f"{value!r} is no plain value",
+                "use finite numbers, texts, booleans, lists, tables",
             )
     for name, variable in p.out.items():
         if variable not in task.variables:
@@ -201,12 +207,12 @@ def _action_place(task: Task, key: str, p: Place) -> Iterator[Fault]:
 
 
 def is_plain(value: Value) -> bool:
-    """Whether a value is plain data."""
+    """Whether a value is plain data that a task file can hold."""
     if isinstance(value, Mapping):
         return all(isinstance(k, str) and is_plain(v) for k, v in value.items())
     if isinstance(value, list | tuple):
         return all(is_plain(v) for v in value)
-    return value is None or isinstance(value, bool | int | float | str)
+    return isinstance(value, bool | int | str) or (isinstance(value, float) and isfinite(value))
 
 
 def _arcs(key: str, t: Transition, places: Mapping[str, Place]) -> Iterator[Fault]:

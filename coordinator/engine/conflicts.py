@@ -1,0 +1,133 @@
+"""One maximal step: which of the fireable transitions fire together, and how conflicts among them are settled."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from coordinator.engine.draft import Draft
+from coordinator.engine.firing import Claims, Match, eligible_runs, match
+from coordinator.engine.instructions import Severity
+from coordinator.task import End
+
+
+@dataclass(frozen=True, slots=True)
+class Draw:
+    """A conflict that a draw by weight has to settle."""
+
+    alternatives: tuple[str, ...]
+    weights: tuple[float, ...]
+
+
+def choose_step(draft: Draft, pulse: str, choices: Sequence[str], only: Sequence[str] | None) -> list[Match] | Draw:
+    """The transitions that fire together on the marking as it is, in an order in which each can fire after the others.
+
+    `choices` are the outcomes of earlier draws for this same step. Looks at the dirty transitions and forgets them.
+    """
+    exits = draft.compiled.exits
+    fireable: list[Match] = []
+    for t in sorted(draft.dirty):
+        x = exits[t]
+        if not (x.pulse and only is not None and x.name not in only) and (found := match(draft, x, pulse)):
+            fireable.append(found)
+    draft.dirty.clear()
+    if len(fireable) < 2:
+        return fireable
+    return _settle(draft, pulse, sorted(fireable, key=_rank_and_place), list(choices))
+
+
+def _settle(draft: Draft, pulse: str, rest: list[Match], choices: list[str]) -> list[Match] | Draw:
+    claims, step = Claims(), list[Match]()
+    while rest:
+        rest = [m for old in rest if (m := match(draft, old.exit, pulse, claims))]
+        if not rest:
+            break
+        head = _first(draft, pulse, rest, claims)
+        rivals = [m for m in _rivals(draft, pulse, head, rest, claims) if _rank(m) == _rank(head)]
+        if rivals:
+            contest = sorted([head, *rivals], key=_rank_and_place)
+            if all(m.exit.weight is not None for m in contest):
+                if not choices:
+                    return Draw(tuple(m.exit.name for m in contest), tuple(m.exit.weight or 0.0 for m in contest))
+                drawn = choices.pop(0)
+                head = next((m for m in contest if m.exit.name == drawn), head)
+            else:
+                _report(draft, contest)
+        step.append(head)
+        claims.add(head)
+        rest = [m for m in rest if m.exit is not head.exit]
+    return step
+
+
+def _rank(m: Match) -> tuple[int, bool]:
+    """Declared priority first; then a run's end before its preemption, unless weights are declared."""
+    return (-m.exit.priority, m.exit.preempts and m.exit.weight is None)
+
+
+def _rank_and_place(m: Match) -> tuple[int, bool, int]:
+    return (*_rank(m), m.exit.index)
+
+
+def _first(draft: Draft, pulse: str, rest: list[Match], claims: Claims) -> Match:
+    """The first by rank, unless it would bar the way (inhibitor, room) of another that does not bar its own."""
+    head, passed = rest[0], set[int]()
+    while True:
+        passed.add(head.exit.index)
+        sooner = (
+            m
+            for m in rest
+            if m.exit.index not in passed
+            and _bars(draft, pulse, claims, head, m)
+            and not _bars(draft, pulse, claims, m, head)
+        )
+        other = next(sooner, None)
+        if other is None:
+            return head
+        head = other
+
+
+def _bars(draft: Draft, pulse: str, claims: Claims, first: Match, then: Match) -> bool:
+    """Whether `then` could not fire after `first` with the tokens of this step's marking."""
+    taken = claims.copy()
+    taken.add(first)
+    return match(draft, then.exit, pulse, taken) is None
+
+
+def _rivals(draft: Draft, pulse: str, head: Match, rest: list[Match], claims: Claims) -> list[Match]:
+    """Those that cannot all fire beside `head`: each bars the other, or together they ask for more than there is."""
+    scarce = _scarce(draft, rest, claims) & _demands(head).keys()
+    return [
+        m
+        for m in rest
+        if m.exit is not head.exit
+        and (
+            scarce & _demands(m).keys()
+            or (_bars(draft, pulse, claims, head, m) and _bars(draft, pulse, claims, m, head))
+        )
+    ]
+
+
+def _demands(m: Match) -> dict[tuple[int, str], int]:
+    """What a match takes, by (place, which tokens of it)."""
+    demands = {(p, ""): w for p, w in m.exit.plain}
+    demands |= {(a.place, a.end.value): a.weight for a in m.exit.actions if a.end is not End.GOING}
+    return demands
+
+
+def _scarce(draft: Draft, rest: list[Match], claims: Claims) -> set[tuple[int, str]]:
+    """The tokens that all of `rest` together ask too many of."""
+    asked: dict[tuple[int, str], int] = {}
+    there: dict[tuple[int, str], int] = {}
+    for m in rest:
+        for key, weight in _demands(m).items():
+            asked[key] = asked.get(key, 0) + weight
+        there |= {(p, ""): draft.marking[p] - claims.used.get(p, 0) for p, _ in m.exit.plain}
+        for arc in m.exit.actions:
+            there[arc.place, arc.end.value] = len(eligible_runs(draft, arc, claims, heard=False))
+    return {key for key, weight in asked.items() if weight > there[key]}
+
+
+def _report(draft: Draft, contest: list[Match]) -> None:
+    names = ", ".join(m.exit.name for m in contest)
+    text = f"nothing settles the conflict of {names}; {contest[0].exit.name} fires, being first in the file"
+    draft.report(Severity.ERROR, "undecided", text, names)

@@ -1,0 +1,155 @@
+"""A state being changed by one stimulus: the working copy, the instructions so far, and what has to be looked at again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from coordinator.engine.compiled import Compiled
+from coordinator.engine.instructions import Instruction, Report, Severity
+from coordinator.engine.state import LIVE, Mode, Phase, Run, State
+from coordinator.net import Marking
+from coordinator.task import Value
+
+
+class Draft:
+    """The working copy. `freeze` gives the next state; the old one is untouched."""
+
+    def __init__(self, compiled: Compiled, state: State) -> None:
+        self.compiled = compiled
+        self.instructions: list[Instruction] = []
+        self.dirty: set[int] = set()
+        """Transitions that may have become fireable."""
+        self.retime: set[int] = set()
+        """Transitions whose `after` timer may have to be armed or disarmed."""
+        self.mode = state.mode
+        self.stimuli = state.stimuli + 1
+        self.firings = state.firings
+        self.timeless = state.timeless
+        self.marking: list[int] = list(state.marking)
+        self.variables: dict[str, Value] = dict(state.variables)
+        self.tokens: dict[str, tuple[Run, ...]] = dict(state.tokens)
+        self.stopping: dict[str, Run] = dict(state.stopping)
+        self.started: dict[str, int] = dict(state.started)
+        self.run_order = state.run_order
+        self.end_order = state.end_order
+        self.flags: set[str] = set(state.flags)
+        self.seen = dict(state.seen)
+        self.timers = dict(state.timers)
+        self.timer_order = state.timer_order
+        self.suspended = state.suspended
+        self.backlog = list(state.backlog)
+        self.breakpoints = state.breakpoints
+        self.deferred = dict(state.deferred)
+        self.told: set[str] = set(state.told)
+        self.ending = state.ending
+
+    def freeze(self) -> State:
+        """The next state."""
+        return State(
+            marking=tuple(self.marking),
+            variables=self.variables,
+            mode=self.mode,
+            stimuli=self.stimuli,
+            firings=self.firings,
+            timeless=self.timeless,
+            tokens=self.tokens,
+            stopping=self.stopping,
+            started=self.started,
+            run_order=self.run_order,
+            end_order=self.end_order,
+            flags=frozenset(self.flags),
+            seen=self.seen,
+            timers=self.timers,
+            timer_order=self.timer_order,
+            suspended=self.suspended,
+            backlog=tuple(self.backlog),
+            breakpoints=self.breakpoints,
+            deferred=self.deferred,
+            told=frozenset(self.told),
+            ending=self.ending,
+        )
+
+    def emit(self, instruction: Instruction) -> None:
+        """Add an instruction."""
+        self.instructions.append(instruction)
+
+    def report(self, severity: Severity, key: str, text: str, of: str = "") -> None:
+        """Tell people."""
+        self.instructions.append(Report(severity, key, text, of))
+
+    def report_once(self, severity: Severity, key: str, text: str, of: str) -> None:
+        """Tell people unless they were told already since `of` last moved."""
+        if of not in self.told:
+            self.told.add(of)
+            self.report(severity, key, text, of)
+
+    def touch(self, place: int) -> None:
+        """Tokens, runs or room of the place have changed."""
+        self.dirty.update(self.compiled.touching[place])
+        self.retime.update(self.compiled.timed[place])
+
+    def touch_all(self) -> None:
+        """Anything may have changed."""
+        self.dirty.update(range(len(self.compiled.exits)))
+        for timed in self.compiled.timed:
+            self.retime.update(timed)
+
+    def write(self, name: str, value: Value) -> None:
+        """A variable has a new value."""
+        self.variables[name] = value
+        self.dirty.update(self.compiled.reading.get(name, ()))
+
+    def snapshot(self) -> Marking:
+        """The marking now."""
+        return tuple(self.marking)
+
+    def stopping_in(self, place: str) -> int:
+        """How many cancelled runs of the place are not known to have stopped."""
+        return sum(r.place == place for r in self.stopping.values()) if self.stopping else 0
+
+    def occupied(self, place: int) -> int:
+        """Tokens of the place and its stopping runs: what exclusion and inhibitors count."""
+        if not self.stopping:
+            return self.marking[place]
+        return self.marking[place] + self.stopping_in(self.compiled.net.places[place])
+
+    def find(self, run_id: str) -> Run | None:
+        """A run with a token, or a stopping one."""
+        for run in self.tokens.get(run_id.rpartition("#")[0], ()):
+            if run.id == run_id:
+                return run
+        return self.stopping.get(run_id)
+
+    def live(self) -> list[Run]:
+        """Runs whose end is still to come."""
+        return [r for runs in self.tokens.values() for r in runs if r.phase in LIVE]
+
+    def enter(self, place: str, index: int) -> None:
+        """A token enters an action place: a run is born."""
+        number = self.started.get(place, 0) + 1
+        self.started[place] = number
+        self.run_order += 1
+        cleared = self.mode in (Mode.RUNNING, Mode.STEPPING)
+        run = Run(f"{place}#{number}", place, self.run_order, Phase.QUEUED, cleared)
+        present = self.tokens.get(place, ())
+        self.tokens[place] = (*present, run)
+        if present and self.compiled.task.places[place].servers is None:
+            text = f"a second token entered {place}, which is declared to hold one; its run waits"
+            self.report(Severity.ERROR, "unsafe", text, place)
+        self.touch(index)
+
+    def leave(self, run: Run) -> None:
+        """A run's token leaves its place."""
+        self.tokens[run.place] = tuple(r for r in self.tokens[run.place] if r.id != run.id)
+        self.told.discard(run.id)
+
+    def put(self, old: Run, **changes: object) -> Run:
+        """Replace a run by a changed one, wherever it is kept."""
+        new = replace(old, **changes)  # type: ignore[arg-type]
+        if old.id in self.stopping:
+            self.stopping[old.id] = new
+        else:
+            self.tokens[old.place] = tuple(new if r.id == old.id else r for r in self.tokens[old.place])
+        place = self.compiled.action_places[old.place]
+        self.touch(place)
+        return new

@@ -1,0 +1,233 @@
+"""Whether a transition can fire, which runs it would take, and its firing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+from typing import NamedTuple
+
+from coordinator.conditions import ConditionFault
+from coordinator.engine.compiled import ActionArc, Exit
+from coordinator.engine.draft import Draft
+from coordinator.engine.instructions import CancelRun, DisarmTimer, Fired, Severity
+from coordinator.engine.state import ACTIVE, LIVE, Phase, Run
+from coordinator.task import Counts, End, Status, Value
+
+
+class Match(NamedTuple):
+    """A fireable transition and the runs that it takes, by action arc."""
+
+    exit: Exit
+    runs: tuple[tuple[Run, ...], ...]
+
+
+class Claims:
+    """What the transitions chosen so far for one step have taken and given."""
+
+    __slots__ = ("change", "flags", "raised", "runs", "used")
+
+    def __init__(self) -> None:
+        self.used: dict[int, int] = {}
+        self.runs: set[str] = set()
+        self.flags: set[str] = set()
+        self.raised: set[tuple[str, str]] = set()
+        self.change: dict[int, int] = {}
+
+    def copy(self) -> Claims:
+        """An independent copy."""
+        other = Claims()
+        other.used, other.change = dict(self.used), dict(self.change)
+        other.runs, other.flags, other.raised = set(self.runs), set(self.flags), set(self.raised)
+        return other
+
+    def add(self, match: Match) -> None:
+        """Take what the match takes."""
+        x = match.exit
+        for p, w in x.plain:
+            self.used[p] = self.used.get(p, 0) + w
+            self.change[p] = self.change.get(p, 0) - w
+        for arc, runs in zip(x.actions, match.runs, strict=True):
+            self.raised.update((r.id, e) for r in runs for e in arc.raised)
+            if arc.end is not End.GOING:
+                self.runs.update(r.id for r in runs)
+                self.change[arc.place] = self.change.get(arc.place, 0) - arc.weight
+        for p, w, _ in x.produce:
+            self.change[p] = self.change.get(p, 0) + w
+        self.flags.update(x.flags)
+
+
+_NOTHING = Claims()
+
+
+def match(draft: Draft, x: Exit, pulse: str, claims: Claims = _NOTHING) -> Match | None:
+    """How the transition can fire beside what was claimed, with the pulse that has just come; None if it cannot."""
+    if x.pulse != pulse and x.pulse:
+        return None
+    if x.never or not _marking_allows(draft, x, claims):
+        return None
+    if any(f not in draft.flags or f in claims.flags for f in x.flags):
+        return None
+    if x.after is not None and not ((timer := draft.timers.get(x.name)) and timer.elapsed):
+        return None
+    eligible = [eligible_runs(draft, arc, claims) for arc in x.actions]
+    if any(len(runs) < arc.weight for arc, runs in zip(x.actions, eligible, strict=True)):
+        return None
+    for runs in _selections(x, eligible):
+        if x.when is None or _condition_holds(draft, x, runs):
+            return Match(x, runs)
+    return None
+
+
+def arcs_satisfied(draft: Draft, x: Exit) -> tuple[Run, ...] | None:
+    """The runs that the transition would take if its events came now; None while its arcs are not satisfied."""
+    if not _marking_allows(draft, x, _NOTHING):
+        return None
+    eligible = [eligible_runs(draft, arc, _NOTHING, heard=False) for arc in x.actions]
+    if any(len(runs) < arc.weight for arc, runs in zip(x.actions, eligible, strict=True)):
+        return None
+    return tuple(r for arc, runs in zip(x.actions, eligible, strict=True) for r in runs[: arc.weight])
+
+
+def token_enabled(draft: Draft, x: Exit) -> bool:
+    """Whether tokens, inhibitors and room enable the transition in the ordinary sense, whatever its runs do."""
+    marking = draft.marking
+    return _marking_allows(draft, x, _NOTHING) and all(marking[a.place] >= a.weight for a in x.actions)
+
+
+def eligible_runs(draft: Draft, arc: ActionArc, claims: Claims, heard: bool = True) -> list[Run]:
+    """Runs that the arc may take, first come first: ended ones by their end, others by their start."""
+    runs = [r for r in draft.tokens.get(arc.name, ()) if _fits(arc, r) and r.id not in claims.runs]
+    if heard and arc.raised:
+        runs = [r for r in runs if all(e in r.raised and (r.id, e) not in claims.raised for e in arc.raised)]
+    if len(runs) > 1 and arc.end in (End.NORMAL, End.ERROR):
+        runs.sort(key=lambda r: r.ended)
+    return runs
+
+
+def fire(draft: Draft, fireable: Match, cause: str) -> None:
+    """Fire: tokens move at once, preempted runs are asked to stop, new runs are born."""
+    x, before, at = fireable.exit, draft.snapshot(), len(draft.instructions)
+    for p, w in x.plain:
+        draft.marking[p] -= w
+        draft.touch(p)
+    taken = tuple(r.id for r in _take_runs(draft, fireable))
+    draft.flags.difference_update(x.flags)
+    _forget_lost(draft, x)
+    places = draft.compiled.net.places
+    for p, w, is_action in x.produce:
+        draft.marking[p] += w
+        draft.touch(p)
+        for _ in range(w if is_action else 0):
+            draft.enter(places[p], p)
+    draft.firings += 1
+    draft.timeless += 1
+    draft.told.discard(x.name)
+    draft.instructions.insert(at, Fired(draft.firings, x.name, before, draft.snapshot(), cause, taken))
+
+
+def cancel(draft: Draft, run: Run, counts: Counts, reason: str) -> None:
+    """The run's token is gone: a run that has begun is stopping until it is known to have stopped."""
+    draft.leave(run)
+    if run.phase not in ACTIVE:
+        return
+    draft.stopping[run.id] = run
+    draft.put(run, phase=Phase.STOPPING, counts=counts, reason=reason)
+    within = draft.compiled.primitives[run.place].stop_within
+    draft.emit(CancelRun(run.id, counts, reason, within))
+
+
+def disarm(draft: Draft, name: str) -> None:
+    """The timer of a transition is not wanted any more."""
+    timer = draft.timers.pop(name, None)
+    if timer is not None and not timer.elapsed:
+        draft.emit(DisarmTimer(timer.key))
+
+
+def _take_runs(draft: Draft, fireable: Match) -> Iterator[Run]:
+    for arc, runs in zip(fireable.exit.actions, fireable.runs, strict=True):
+        for run in (draft.find(r.id) or r for r in runs):
+            if arc.end is End.GOING:
+                draft.put(run, raised=run.raised.difference(arc.raised))
+                continue
+            draft.marking[arc.place] -= 1
+            draft.touch(arc.place)
+            cancel(draft, run, arc.counts, f"preempted by {fireable.exit.name}")
+            yield run
+
+
+def _forget_lost(draft: Draft, fired: Exit) -> None:
+    """Between taking and giving: timers and latches whose transitions have lost their tokens are forgotten."""
+    if draft.timers:
+        disarm(draft, fired.name)
+        for name in list(draft.timers):
+            x = draft.compiled.exits[draft.compiled.net.transition_index[name]]
+            if arcs_satisfied(draft, x) is None:
+                disarm(draft, name)
+                draft.retime.add(x.index)
+        if fired.after is not None:
+            draft.retime.add(fired.index)
+    forget_flags(draft)
+
+
+def forget_flags(draft: Draft) -> None:
+    """Drop latched events that nothing waits for any more, unless they are declared `early = "keep"`."""
+    for flag in tuple(draft.flags):
+        if flag not in draft.compiled.kept and not awaited(draft, flag):
+            draft.flags.discard(flag)
+
+
+def awaited(draft: Draft, event: str) -> bool:
+    """Whether tokens enable a transition that waits for the event."""
+    exits = draft.compiled.exits
+    return any(token_enabled(draft, exits[t]) for t in draft.compiled.waiting.get(event, ()))
+
+
+def _marking_allows(draft: Draft, x: Exit, claims: Claims) -> bool:
+    marking, used = draft.marking, claims.used
+    for p, w in x.plain:
+        if marking[p] - used.get(p, 0) < w:
+            return False
+    for p, k in x.inhibit:
+        if draft.occupied(p) + claims.change.get(p, 0) >= k:
+            return False
+    return not any(draft.occupied(p) + claims.change.get(p, 0) + gain > limit for p, gain, limit in x.room)
+
+
+def _fits(arc: ActionArc, run: Run) -> bool:
+    if run.phase is Phase.DONE:
+        if arc.takes_done:
+            return True
+        return arc.end is (End.ERROR if run.status is Status.ERROR else End.NORMAL)
+    return run.phase in LIVE and (arc.end is End.PREEMPT or arc.end is End.GOING)
+
+
+def _selections(x: Exit, eligible: list[list[Run]]) -> Iterator[tuple[tuple[Run, ...], ...]]:
+    """Which runs to take: the first ones, or every choice where the condition depends on the run."""
+    if not x.judges_runs:
+        yield tuple([tuple(runs[: arc.weight]) for arc, runs in zip(x.actions, eligible, strict=True)])
+        return
+    windows = [
+        [tuple(runs[i : i + arc.weight]) for i in range(len(runs) - arc.weight + 1)]
+        for arc, runs in zip(x.actions, eligible, strict=True)
+    ]
+    yield from product(*windows)
+
+
+def _condition_holds(draft: Draft, x: Exit, runs: tuple[tuple[Run, ...], ...]) -> bool:
+    values = draft.variables
+    if x.judges_runs:
+        values = dict(values)
+        for run in (r for rs in runs for r in rs if r.phase is Phase.DONE):
+            values |= verdict_variables(run)
+    try:
+        return x.when is None or x.when.holds(values)
+    except ConditionFault as fault:
+        text = f"the condition of {x.name} has no truth value: {fault}; it counts as false"
+        draft.report_once(Severity.WARNING, "condition", text, x.name)
+        return False
+
+
+def verdict_variables(run: Run) -> dict[str, Value]:
+    """The variables that tell how a run of its place ended."""
+    status = None if run.status is None else run.status.value
+    return {f"{run.place}.status": status, f"{run.place}.reason": run.cause}

@@ -1,0 +1,315 @@
+"""The engine: a task as a pure machine that takes stimuli in and gives instructions out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from coordinator.engine import operator, runs
+from coordinator.engine.compiled import compile_task
+from coordinator.engine.draft import Draft
+from coordinator.engine.firing import awaited
+from coordinator.engine.instructions import (
+    ArmTimer,
+    CancelRun,
+    Choose,
+    HoldRun,
+    HoldTimer,
+    Instruction,
+    Severity,
+    StartRun,
+    Subject,
+)
+from coordinator.engine.state import ACTIVE, Mode, Phase, Run, State, Suspended
+from coordinator.engine.step import Policy, abort, settle
+from coordinator.engine.stimuli import (
+    Abort,
+    AddTokens,
+    Begin,
+    Chosen,
+    EventOccurred,
+    ForceExit,
+    Hold,
+    Pause,
+    RaiseEvent,
+    RemoveTokens,
+    Resume,
+    RunEnded,
+    RunHeld,
+    RunRaised,
+    RunStarted,
+    SetBreakpoints,
+    Step,
+    Stimulus,
+    StopConfirmed,
+    StopFailed,
+    TimerFired,
+    VariableChanged,
+    Verdict,
+)
+from coordinator.engine.timers import elapse, hold_timers_of
+from coordinator.task import Counts, Memory, Scope, Task, VariableType
+
+_AFTER_THE_END = (RunEnded, StopConfirmed, StopFailed, Verdict)
+_ALWAYS_HEARD = (Abort, Verdict, SetBreakpoints)
+
+
+class Engine:
+    """A task compiled for execution. Immutable: all that changes is in the `State`.
+
+    `devices` names the device of each action that uses one. Two runs never have one device at once; an action of a
+    primitive task with `start = "at_once"` is excepted.
+    """
+
+    def __init__(self, task: Task, devices: Mapping[str, str] | None = None, policy: Policy | None = None) -> None:
+        """Compile. Raises ValueError with every fault of an inconsistent task."""
+        self.task = task
+        self.policy = policy or Policy()
+        self.compiled = compile_task(task, devices or {})
+        self._handlers: dict[type, Callable[[Draft, Any], None]] = {
+            Begin: self._begin,
+            RunStarted: self._run_started,
+            RunEnded: self._run_ended,
+            RunRaised: self._run_raised,
+            EventOccurred: self._event_occurred,
+            TimerFired: self._timer_fired,
+            VariableChanged: self._variable_changed,
+            Chosen: self._chosen,
+            StopConfirmed: self._stop_confirmed,
+            StopFailed: self._stop_failed,
+            Verdict: runs.correct,
+            RunHeld: self._run_held,
+            Pause: lambda draft, s: operator.pause_net(draft, s.reason),
+            Resume: lambda draft, s: operator.go_on(draft, self.policy),
+            Step: lambda draft, s: operator.single_step(draft, self.policy),
+            SetBreakpoints: operator.set_breakpoints,
+            AddTokens: lambda draft, s: operator.add_tokens(draft, self.policy, s),
+            RemoveTokens: lambda draft, s: operator.remove_tokens(draft, self.policy, s),
+            RaiseEvent: self._raise_event,
+            ForceExit: lambda draft, s: operator.force_exit(draft, self.policy, s),
+            Abort: self._abort,
+        }
+
+    def initial(self) -> State:
+        """The state before `Begin`."""
+        return State(self.compiled.net.initial, self.compiled.task.initial_variables())
+
+    def handle(self, state: State, stimulus: Stimulus) -> tuple[State, tuple[Instruction, ...]]:
+        """The next state and what is to be done. Pure; a stimulus that makes no sense is reported and changes nothing."""
+        draft = Draft(self.compiled, state)
+        self._take(draft, stimulus)
+        while draft.backlog and not _waits_for_draw(draft):
+            self._take(draft, draft.backlog.pop(0))
+        return draft.freeze(), tuple(draft.instructions)
+
+    def awaits(self, state: State, event: str) -> bool:
+        """Whether tokens enable a transition that waits for the event: any other pulse would change nothing."""
+        return awaited(Draft(self.compiled, state), event)
+
+    def outstanding(self, state: State) -> tuple[Instruction, ...]:
+        """The orders that are still in force, for whoever takes over a state: choices, runs, cancels, holds, timers."""
+        draft = Draft(self.compiled, state)
+        for run in [r for rs in state.tokens.values() for r in rs] + list(state.stopping.values()):
+            self._order_again(draft, run)
+        for name, timer in state.timers.items():
+            if not timer.elapsed:
+                after = self.compiled.task.transitions[name].after or 0.0
+                draft.emit(ArmTimer(timer.key, name, after))
+                if timer.held:
+                    draft.emit(HoldTimer(timer.key))
+        waiting = state.suspended
+        if waiting is not None and waiting.key:
+            names = waiting.alternatives
+            draft.emit(Choose(waiting.key, Subject.CONFLICT, ", ".join(names), names, waiting.weights))
+        return tuple(draft.instructions)
+
+    def _order_again(self, draft: Draft, run: Run) -> None:
+        primitive = self.compiled.primitives[run.place]
+        if run.phase is Phase.CHOOSING:
+            draft.emit(Choose(run.id, Subject.ACTION, primitive.name, primitive.alternatives))
+        elif run.phase in ACTIVE:
+            deadline = primitive.deadline
+            draft.emit(StartRun(run.id, run.place, primitive.name, run.action, run.arguments, deadline))
+            if run.phase is Phase.HELD:
+                draft.emit(HoldRun(run.id))
+        elif run.phase in (Phase.STOPPING, Phase.STUCK):
+            draft.emit(CancelRun(run.id, run.counts or Counts.NONE, run.reason, primitive.stop_within))
+
+    def _take(self, draft: Draft, stimulus: Stimulus) -> None:
+        kind = type(stimulus)
+        if kind is not Chosen:
+            draft.timeless = 0
+        if draft.mode is Mode.FRESH and kind is not Begin and kind is not SetBreakpoints:
+            _note(draft, "not_begun", f"{kind.__name__} came before the mission run began")
+        elif draft.mode is Mode.FINISHED and not isinstance(stimulus, _AFTER_THE_END):
+            _note(draft, "finished", f"{kind.__name__} came after the mission run had ended")
+        elif _waits_for_draw(draft) and kind is not Chosen and not isinstance(stimulus, _ALWAYS_HEARD):
+            draft.backlog.append(stimulus)
+        else:
+            self._handlers[kind](draft, stimulus)
+
+    def _begin(self, draft: Draft, stimulus: Begin) -> None:
+        if draft.mode is not Mode.FRESH:
+            _note(draft, "begun", "the mission run has begun already")
+            return
+        draft.mode = Mode.RUNNING
+        task = self.compiled.task
+        for name, value in stimulus.parameters.items():
+            if name not in task.parameters or not VariableType.of(task.parameters[name]).admits(value):
+                _warn(draft, "bad_parameter", f"{name} = {value!r} is no parameter of {task.name}; ignored", name)
+            else:
+                draft.write(name, value)
+        for name, value in stimulus.variables.items():
+            _write(draft, name, value)
+        for place, index in self.compiled.action_places.items():
+            for _ in range(draft.marking[index]):
+                draft.enter(place, index)
+        draft.touch_all()
+        settle(draft, self.policy, "Begin")
+
+    def _run_started(self, draft: Draft, stimulus: RunStarted) -> None:
+        run = draft.find(stimulus.run)
+        if run is not None and run.phase is Phase.STARTING:
+            draft.put(run, phase=Phase.RUNNING)
+
+    def _run_ended(self, draft: Draft, stimulus: RunEnded) -> None:
+        run = draft.find(stimulus.run)
+        if run is None or run.phase not in (*ACTIVE, Phase.STOPPING, Phase.STUCK):
+            _note(
+                draft, "unknown_run", f"{stimulus.run} ended ({stimulus.status}), but it was not going on", stimulus.run
+            )
+        elif run.phase in ACTIVE:
+            runs.end_run(draft, run, stimulus)
+            settle(draft, self.policy, "RunEnded")
+        else:
+            runs.end_stopping(draft, run, stimulus)
+            settle(draft, self.policy, "StopConfirmed")
+
+    def _run_raised(self, draft: Draft, stimulus: RunRaised) -> None:
+        run, event = draft.find(stimulus.run), self.compiled.task.events.get(stimulus.event)
+        if run is None or run.phase not in ACTIVE:
+            _note(
+                draft, "unknown_run", f"{stimulus.run} raised {stimulus.event}, but it was not going on", stimulus.run
+            )
+        elif event is None or event.scope is not Scope.INTERNAL or event.by != self.compiled.primitives[run.place].name:
+            text = f"{run.id} raised {stimulus.event!r}, which is no internal event of its primitive task; ignored"
+            _warn(draft, "unknown_event", text, stimulus.event)
+        else:
+            draft.put(run, raised=run.raised | {stimulus.event})
+            settle(draft, self.policy, "RunRaised")
+
+    def _event_occurred(self, draft: Draft, stimulus: EventOccurred) -> None:
+        if stimulus.number:
+            if stimulus.number <= draft.seen.get(stimulus.source, 0):
+                return
+            draft.seen[stimulus.source] = stimulus.number
+        self._occur(draft, stimulus.event, "EventOccurred")
+
+    def _raise_event(self, draft: Draft, stimulus: RaiseEvent) -> None:
+        self._occur(draft, stimulus.event, "RaiseEvent")
+
+    def _occur(self, draft: Draft, name: str, cause: str) -> None:
+        event = self.compiled.task.events.get(name)
+        if event is None or event.scope is not Scope.EXTERNAL:
+            _warn(draft, "unknown_event", f"{name!r} is no external event of the task; ignored", name)
+        elif event.memory is Memory.PULSE:
+            draft.dirty.update(self.compiled.waiting.get(name, ()))
+            settle(draft, self.policy, cause, pulse=name)
+        elif name in self.compiled.kept or awaited(draft, name):
+            draft.flags.add(name)
+            draft.dirty.update(self.compiled.waiting.get(name, ()))
+            settle(draft, self.policy, cause)
+        else:
+            _note(draft, "early_event", f"{name} came when nothing waited for it; it is forgotten", name)
+
+    def _timer_fired(self, draft: Draft, stimulus: TimerFired) -> None:
+        if elapse(draft, stimulus.key):
+            settle(draft, self.policy, "TimerFired")
+
+    def _variable_changed(self, draft: Draft, stimulus: VariableChanged) -> None:
+        if _write(draft, stimulus.name, stimulus.value):
+            settle(draft, self.policy, "VariableChanged")
+
+    def _chosen(self, draft: Draft, stimulus: Chosen) -> None:
+        waiting = draft.suspended
+        if waiting is not None and waiting.key and waiting.key == stimulus.key:
+            self._drawn(draft, stimulus, waiting)
+            return
+        run = draft.find(stimulus.key)
+        if run is None or run.phase is not Phase.CHOOSING:
+            _note(draft, "no_choice", f"no choice is open on {stimulus.key}", stimulus.key)
+        elif stimulus.alternative not in self.compiled.primitives[run.place].alternatives:
+            text = f"{stimulus.alternative!r} is no alternative of {self.compiled.primitives[run.place].name}"
+            _warn(draft, "bad_choice", text, stimulus.key)
+        elif _waits_for_draw(draft):
+            draft.backlog.append(stimulus)
+        else:
+            runs.chosen(draft, run, stimulus.alternative)
+            settle(draft, self.policy, "Chosen")
+
+    def _drawn(self, draft: Draft, stimulus: Chosen, waiting: Suspended) -> None:
+        if stimulus.alternative not in waiting.alternatives:
+            text = f"{stimulus.alternative!r} is none of {', '.join(waiting.alternatives)}"
+            _warn(draft, "bad_choice", text, stimulus.key)
+            return
+        draft.suspended = None
+        draft.touch_all()
+        choices = (*waiting.choices, stimulus.alternative)
+        step = Suspended(waiting.pulse, waiting.cause, choices, passed=waiting.passed, only=waiting.only)
+        settle(draft, self.policy, waiting.cause, step=step)
+
+    def _stop_confirmed(self, draft: Draft, stimulus: StopConfirmed) -> None:
+        run = draft.stopping.get(stimulus.run)
+        if run is None:
+            _note(draft, "unknown_run", f"{stimulus.run} is said to have stopped, but was not stopping", stimulus.run)
+            return
+        runs.confirm_stop(draft, run, stimulus)
+        settle(draft, self.policy, "StopConfirmed")
+
+    def _stop_failed(self, draft: Draft, stimulus: StopFailed) -> None:
+        run = draft.stopping.get(stimulus.run)
+        if run is None or run.phase is Phase.STUCK:
+            _note(draft, "unknown_run", f"{stimulus.run} is said not to stop, but was not stopping", stimulus.run)
+            return
+        runs.fail_stop(draft, run, stimulus)
+        settle(draft, self.policy, "StopFailed")
+
+    def _run_held(self, draft: Draft, stimulus: RunHeld) -> None:
+        run = draft.find(stimulus.run)
+        if run is None or run.phase not in ACTIVE or draft.mode is not Mode.PAUSED:
+            return
+        if stimulus.answer is Hold.HELD:
+            draft.put(run, phase=Phase.HELD)
+            hold_timers_of(draft, run.id)
+        else:
+            _note(draft, "not_held", f"{run.id} ({run.action}): {stimulus.answer}", run.id)
+
+    def _abort(self, draft: Draft, stimulus: Abort) -> None:
+        if draft.mode is not Mode.ABORTING:
+            abort(draft, stimulus.reason)
+            settle(draft, self.policy, "Abort")
+
+
+def _waits_for_draw(draft: Draft) -> bool:
+    return draft.suspended is not None and bool(draft.suspended.key)
+
+
+def _write(draft: Draft, name: str, value: Any) -> bool:
+    """Write a watched variable; a value of another type is reported and leaves none."""
+    variable = draft.compiled.task.variables.get(name)
+    if variable is None:
+        _note(draft, "unknown_variable", f"{name!r} is no variable of the task; ignored", name)
+        return False
+    if not variable.type.admits(value):
+        _warn(draft, "bad_value", f"{name} = {value!r} is no {variable.type}; it is none now", name)
+        value = None
+    draft.write(name, value)
+    return True
+
+
+def _note(draft: Draft, key: str, text: str, of: str = "") -> None:
+    draft.report(Severity.NOTE, key, text, of)
+
+
+def _warn(draft: Draft, key: str, text: str, of: str = "") -> None:
+    draft.report(Severity.WARNING, key, text, of)

@@ -1,0 +1,147 @@
+"""The operator's hand on the net: tokens in control places, forced exits, pause, step and breakpoints as stimuli."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from coordinator.engine.draft import Draft
+from coordinator.engine.firing import Match, arcs_satisfied, fire, forget_flags
+from coordinator.engine.instructions import Marked, Severity
+from coordinator.engine.state import LIVE, Mode, Phase, Run
+from coordinator.engine.step import MOVING, Policy, pause, release, resume, settle
+from coordinator.engine.stimuli import AddTokens, ForceExit, RemoveTokens, SetBreakpoints
+from coordinator.task import Counts, End, Kind
+from coordinator.wording import nearest
+
+
+def add_tokens(draft: Draft, policy: Policy, command: AddTokens) -> None:
+    """Tokens enter a control place, as far as its capacity allows."""
+    p = _control_place(draft, command.place, command.tokens)
+    if p is None:
+        return
+    capacity = draft.compiled.net.capacity[p]
+    if capacity is not None and draft.marking[p] + command.tokens > capacity:
+        refuse(draft, f"{command.place} holds {draft.marking[p]} tokens and at most {capacity}", command.place)
+        return
+    _mark(draft, p, command.tokens)
+    settle(draft, policy, "AddTokens")
+
+
+def remove_tokens(draft: Draft, policy: Policy, command: RemoveTokens) -> None:
+    """Tokens leave a control place, as far as there are some."""
+    p = _control_place(draft, command.place, command.tokens)
+    if p is None:
+        return
+    if draft.marking[p] < command.tokens:
+        refuse(draft, f"{command.place} holds only {draft.marking[p]} tokens", command.place)
+        return
+    _mark(draft, p, -command.tokens)
+    forget_flags(draft)
+    settle(draft, policy, "RemoveTokens")
+
+
+def set_breakpoints(draft: Draft, command: SetBreakpoints) -> None:
+    """Replace the breakpoints; unknown names are refused and the others set."""
+    known = {*draft.compiled.net.places, *draft.compiled.net.transitions}
+    for name in command.names:
+        if name not in known:
+            refuse(draft, f"{name!r} is no place and no transition{nearest(name, known)}", name)
+    draft.breakpoints = frozenset(command.names) & known
+
+
+def pause_net(draft: Draft, reason: str) -> None:
+    """Pause, unless there is nothing to pause."""
+    if draft.mode in MOVING:
+        pause(draft, reason or "operator")
+    else:
+        refuse(draft, f"nothing to pause: the mission run is {draft.mode}", "")
+
+
+def go_on(draft: Draft, policy: Policy) -> None:
+    """Resume."""
+    if draft.mode not in (Mode.PAUSED, Mode.STEPPING):
+        refuse(draft, f"nothing to resume: the mission run is {draft.mode}", "")
+        return
+    step, draft.suspended = draft.suspended, None
+    resume(draft, Mode.RUNNING)
+    settle(draft, policy, "Resume", step=step)
+
+
+def single_step(draft: Draft, policy: Policy) -> None:
+    """One firing: at once if something can fire, else held runs go on until something can."""
+    if draft.mode not in (Mode.PAUSED, Mode.RUNNING, Mode.STEPPING):
+        refuse(draft, f"no step: the mission run is {draft.mode}", "")
+        return
+    step, draft.suspended = draft.suspended, None
+    resume(draft, Mode.STEPPING)
+    settle(draft, policy, "Step", step=step)
+    if draft.mode is Mode.STEPPING:
+        release(draft)
+
+
+def force_exit(draft: Draft, policy: Policy, command: ForceExit) -> None:
+    """Fire a transition whatever its runs do, its events, time and condition; runs that go on count none."""
+    index = draft.compiled.net.transition_index.get(command.transition)
+    if index is None:
+        known = draft.compiled.net.transitions
+        refuse(
+            draft, f"{command.transition!r} is no transition{nearest(command.transition, known)}", command.transition
+        )
+        return
+    x = draft.compiled.exits[index]
+    if draft.mode not in (*MOVING, Mode.PAUSED):
+        refuse(draft, f"{x.name} cannot be forced now: the mission run is {draft.mode}", x.name)
+        return
+    runs = tuple(tuple(_forced_runs(draft, a.name, a.end)[: a.weight]) for a in x.actions)
+    enough = all(len(taken) == a.weight for taken, a in zip(runs, x.actions, strict=True))
+    if not x.actions or not enough or not _others_allow(draft, index):
+        why = "it leaves no action place" if not x.actions else "a token that it needs is missing, or a place is full"
+        refuse(draft, f"{x.name} cannot be forced: {why}", x.name)
+        return
+    _fire_forced(draft, Match(x, runs))
+    settle(draft, policy, "stability")
+
+
+def refuse(draft: Draft, text: str, of: str) -> None:
+    """A command that cannot be carried out changes nothing."""
+    draft.report(Severity.WARNING, "refused", text, of)
+
+
+def _control_place(draft: Draft, name: str, tokens: int) -> int | None:
+    place = draft.compiled.task.places.get(name)
+    if place is None or place.kind is not Kind.CONTROL:
+        controls = [p.name for p in draft.compiled.task.places.values() if p.kind is Kind.CONTROL]
+        refuse(draft, f"{name!r} is no control place{nearest(name, controls)}", name)
+    elif tokens < 1:
+        refuse(draft, f"{tokens} tokens are none", name)
+    elif draft.mode in (Mode.FRESH, Mode.ABORTING, Mode.FINISHED):
+        refuse(draft, f"no tokens move: the mission run is {draft.mode}", name)
+    else:
+        return draft.compiled.net.place_index[name]
+    return None
+
+
+def _mark(draft: Draft, place: int, tokens: int) -> None:
+    before = draft.snapshot()
+    draft.marking[place] += tokens
+    draft.touch(place)
+    draft.emit(Marked(draft.compiled.net.places[place], before, draft.snapshot()))
+
+
+def _forced_runs(draft: Draft, place: str, end: End) -> list[Run]:
+    """Runs whose token a forced exit takes: ended ones first, then by age."""
+    runs = draft.tokens.get(place, ())
+    if end is End.GOING:
+        return [r for r in runs if r.phase in LIVE]
+    return sorted(runs, key=lambda r: (r.phase is not Phase.DONE, r.ended, r.order))
+
+
+def _others_allow(draft: Draft, index: int) -> bool:
+    """Whether plain inputs, inhibitors and room allow the forced exit."""
+    return arcs_satisfied(draft, replace(draft.compiled.exits[index], actions=())) is not None
+
+
+def _fire_forced(draft: Draft, forced: Match) -> None:
+    x = forced.exit
+    actions = tuple(replace(a, counts=Counts.NONE, raised=()) for a in x.actions)
+    fire(draft, Match(replace(x, actions=actions, flags=()), forced.runs), "ForceExit")

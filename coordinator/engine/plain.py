@@ -1,0 +1,154 @@
+"""States, stimuli and instructions as plain data and back, for journals, snapshots and the operator's protocol.
+
+A record becomes a mapping of its fields; a field at its default is left out. Stimuli and instructions carry their class
+name as `kind`. Reading checks every field against its annotation and refuses what does not fit with a ValueError.
+"""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, fields, is_dataclass
+from enum import StrEnum
+from functools import cache
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+from coordinator.engine.instructions import Instruction
+from coordinator.engine.state import State
+from coordinator.engine.stimuli import Stimulus
+
+Reader = Callable[[Any, str], Any]
+_KINDS: Mapping[str, type] = {c.__name__: c for c in (*get_args(Stimulus), *get_args(Instruction))}
+
+
+def to_plain(record: State | Stimulus | Instruction) -> dict[str, Any]:
+    """The record as plain data."""
+    plain: dict[str, Any] = _plain(record)
+    return plain
+
+
+def state_from_plain(data: Mapping[str, Any]) -> State:
+    """The state that `to_plain` described. Raises ValueError naming the first field that does not fit."""
+    state: State = _reader(State)(data, "state")
+    return state
+
+
+def stimulus_from_plain(data: Mapping[str, Any]) -> Stimulus:
+    """The stimulus that `to_plain` described. Raises ValueError."""
+    stimulus: Stimulus = _tagged(Stimulus, data)
+    return stimulus
+
+
+def instruction_from_plain(data: Mapping[str, Any]) -> Instruction:
+    """The instruction that `to_plain` described. Raises ValueError."""
+    instruction: Instruction = _tagged(Instruction, data)
+    return instruction
+
+
+def _plain(value: Any) -> Any:
+    if is_dataclass(value):
+        return _fields(value)
+    if isinstance(value, StrEnum):
+        return value.value
+    if isinstance(value, Mapping):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, frozenset):
+        return sorted(value)
+    return [_plain(v) for v in value] if isinstance(value, list | tuple) else value
+
+
+def _fields(record: Any) -> dict[str, Any]:
+    name = type(record).__name__
+    plain: dict[str, Any] = {"kind": name} if name in _KINDS else {}
+    for f in fields(record):
+        value = getattr(record, f.name)
+        if f.default is not MISSING and value == f.default and type(value) is type(f.default):
+            continue
+        if f.default_factory is not MISSING and not value:
+            continue
+        plain[f.name] = _plain(value)
+    return plain
+
+
+def _tagged(union: Any, data: Any) -> Any:
+    if not isinstance(data, Mapping) or not isinstance(data.get("kind"), str):
+        raise ValueError("a record needs its `kind`")
+    cls = _KINDS.get(data["kind"])
+    if cls not in get_args(union):
+        raise ValueError(f"{data['kind']!r} is none of {', '.join(c.__name__ for c in get_args(union))}")
+    return _reader(cls)({k: v for k, v in data.items() if k != "kind"}, data["kind"])
+
+
+@cache
+def _reader(hint: Any) -> Reader:
+    """How a value with this annotation is read."""
+    if hint is Any:
+        return lambda value, where: value
+    if get_origin(hint) in (Union, types.UnionType):
+        return _union_reader(hint)
+    if get_origin(hint) is not None:
+        return _container_reader(get_origin(hint), get_args(hint))
+    if is_dataclass(hint):
+        return _record_reader(hint)
+    if isinstance(hint, type) and issubclass(hint, StrEnum):
+        return _enum_reader(hint)
+    return _scalar_reader(hint)
+
+
+def _union_reader(hint: Any) -> Reader:
+    if set(get_args(hint)) == set(get_args(Stimulus)):
+        return lambda value, where: _tagged(Stimulus, value)
+    inner = _reader(next(a for a in get_args(hint) if a is not type(None)))
+    return lambda value, where: None if value is None else inner(value, where)
+
+
+def _container_reader(origin: Any, args: tuple[Any, ...]) -> Reader:
+    item = _reader(args[-1] if origin not in (tuple,) else args[0])
+    if issubclass(origin, Mapping):
+        return lambda value, where: {
+            k: item(v, f"{where}.{k}") for k, v in _of(value, Mapping, where).items() if _of(k, str, where) is k
+        }
+    return lambda value, where: origin(
+        [item(v, f"{where}[{i}]") for i, v in enumerate(_of(value, list | tuple, where))]
+    )
+
+
+def _record_reader(cls: Any) -> Reader:
+    hints = get_type_hints(cls)
+    required = {f.name for f in fields(cls) if f.default is MISSING and f.default_factory is MISSING}
+
+    def read(value: Any, where: str) -> Any:
+        data = _of(value, Mapping, where)
+        unknown, missing = set(data) - set(hints), required - set(data)
+        if unknown or missing:
+            raise ValueError(f"{where}: unknown {sorted(unknown)}, missing {sorted(missing)}")
+        return cls(**{k: _reader(hints[k])(v, f"{where}.{k}") for k, v in data.items()})
+
+    return read
+
+
+def _enum_reader(enum: type[StrEnum]) -> Reader:
+    def read(value: Any, where: str) -> Any:
+        try:
+            return enum(value)
+        except ValueError:
+            raise ValueError(f"{where}: {value!r} is none of {', '.join(enum)}") from None
+
+    return read
+
+
+def _scalar_reader(kind: type) -> Reader:
+    def read(value: Any, where: str) -> Any:
+        if kind is float and isinstance(value, int) and not isinstance(value, bool):
+            return float(value)
+        if kind is int and isinstance(value, bool):
+            raise ValueError(f"{where}: {value!r} is no int")
+        return _of(value, kind, where)
+
+    return read
+
+
+def _of(value: Any, kind: Any, where: str) -> Any:
+    if not isinstance(value, kind):
+        raise ValueError(f"{where}: {value!r} is no {getattr(kind, '__name__', kind)}")
+    return value

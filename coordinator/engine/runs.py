@@ -1,0 +1,172 @@
+"""Runs from the queue to their end: servers, choice of action, device fences, results, verdicts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from coordinator.engine.draft import Draft
+from coordinator.engine.firing import verdict_variables
+from coordinator.engine.instructions import Choose, Corrected, RunRecorded, Severity, StartRun, Subject
+from coordinator.engine.state import ACTIVE, UNSTARTED, Deferred, Phase, Run
+from coordinator.engine.stimuli import RunEnded, StopConfirmed, StopFailed, Verdict
+from coordinator.task import Counts, Executed, Reference, Start, Status, Value
+
+
+def admit(draft: Draft) -> bool:
+    """Bring waiting runs as far as they can go, first come first served; True if one of them ended in ERROR at once."""
+    waiting = [r for runs in draft.tokens.values() for r in runs if r.phase in UNSTARTED]
+    if not waiting:
+        return False
+    ended = False
+    for run in sorted(waiting, key=lambda r: r.order) if len(waiting) > 1 else waiting:
+        if not run.cleared:
+            continue
+        current = run
+        if current.phase is Phase.QUEUED and _has_server(draft, current.place):
+            current = _choose(draft, current)
+        if current.phase is Phase.WAITING:
+            ended |= _start(draft, current)
+    return ended
+
+
+def chosen(draft: Draft, run: Run, action: str) -> None:
+    """The action of a run is known; it waits for its device from now on."""
+    primitive = draft.compiled.primitives[run.place]
+    device = draft.compiled.devices.get(action, "")
+    at_once = primitive.start is Start.AT_ONCE
+    draft.put(run, phase=Phase.WAITING, action=action, device=device, at_once=at_once)
+
+
+def end_run(draft: Draft, run: Run, end: RunEnded) -> None:
+    """A run that went on is done: what it wrote and why it ended are known before anything fires."""
+    draft.end_order += 1
+    done = draft.put(
+        run,
+        phase=Phase.DONE,
+        status=end.status,
+        cause=end.cause,
+        ended=draft.end_order,
+        arguments={},
+        raised=run.raised,
+    )
+    _write_results(draft, run, end)
+    for name, value in verdict_variables(done).items():
+        draft.write(name, value)
+    if end.deferred:
+        draft.deferred[run.id] = Deferred(run.place, run.action, end.status)
+    _record(draft, run, end.status, end, cancelled=False)
+
+
+def end_stopping(draft: Draft, run: Run, end: RunEnded) -> None:
+    """A result that came after the cancel: recorded, moves nothing, its writes are dropped; the run has stopped."""
+    _forget(draft, run)
+    counted = run.counts or Counts.NONE
+    status = None if counted is Counts.NONE else Status(counted.value)
+    text = f"{run.reason}; it had ended with {end.status}" + (f", {end.cause}" if end.cause else "")
+    _record(draft, run, status, replace(end, text=text), cancelled=True)
+
+
+def confirm_stop(draft: Draft, run: Run, stop: StopConfirmed) -> None:
+    """A cancelled run has stopped: its device is free."""
+    _forget(draft, run)
+    counted = run.counts or Counts.NONE
+    status = None if counted is Counts.NONE or stop.executed is Executed.NO else Status(counted.value)
+    end = RunEnded(run.id, Status.ERROR, "cancelled", run.reason, stop.executed, seconds=stop.seconds)
+    _record(draft, run, status, end, cancelled=True)
+
+
+def fail_stop(draft: Draft, run: Run, stop: StopFailed) -> None:
+    """A cancelled run could not be stopped: its device stays fenced, and runs that wait for it end in ERROR."""
+    draft.put(run, phase=Phase.STUCK)
+    text = f"{run.id} could not be stopped{': ' + stop.text if stop.text else ''}"
+    draft.report(Severity.ERROR, "stuck_run", f"{text}; its device {run.device or '(none)'} stays fenced", run.id)
+
+
+def correct(draft: Draft, verdict: Verdict) -> None:
+    """A deferred verdict: once, and for the estimates alone."""
+    known = draft.deferred.pop(verdict.run, None)
+    if known is None:
+        draft.report(Severity.NOTE, "no_verdict_due", f"no verdict is due on {verdict.run}", verdict.run)
+        return
+    draft.emit(Corrected(verdict.run, known.place, known.action, known.status, verdict.status, verdict.cause))
+
+
+def _forget(draft: Draft, run: Run) -> None:
+    del draft.stopping[run.id]
+    draft.touch(draft.compiled.action_places[run.place])
+
+
+def _record(draft: Draft, run: Run, status: Status | None, end: RunEnded, cancelled: bool) -> None:
+    primitive = draft.compiled.primitives[run.place].name
+    draft.emit(
+        RunRecorded(
+            run.id,
+            run.place,
+            primitive,
+            run.action,
+            status,
+            end.cause,
+            end.text,
+            end.executed,
+            end.seconds,
+            cancelled,
+            end.deferred and not cancelled,
+        )
+    )
+
+
+def _write_results(draft: Draft, run: Run, end: RunEnded) -> None:
+    task = draft.compiled.task
+    for name, variable in task.places[run.place].out.items():
+        if name not in end.values and end.status is Status.ERROR:
+            continue
+        value = end.values.get(name)
+        declared = task.variables[variable].type
+        if not declared.admits(value) or name not in end.values:
+            was = f"gave {value!r}, which is no {declared}" if name in end.values else "gave nothing"
+            text = f"{run.id} ({run.action}) {was} for {name!r}; variable {variable} is none now"
+            draft.report(Severity.WARNING, "bad_value", text, run.id)
+            value = None
+        draft.write(variable, value)
+
+
+def _has_server(draft: Draft, place: str) -> bool:
+    going = sum(r.phase in ACTIVE or r.phase in (Phase.CHOOSING, Phase.WAITING) for r in draft.tokens[place])
+    going += sum(r.place == place and r.phase is Phase.STOPPING for r in draft.stopping.values())
+    return going < (draft.compiled.task.places[place].servers or 1)
+
+
+def _choose(draft: Draft, run: Run) -> Run:
+    primitive = draft.compiled.primitives[run.place]
+    if len(primitive.alternatives) == 1:
+        chosen(draft, run, primitive.alternatives[0])
+    else:
+        draft.put(run, phase=Phase.CHOOSING)
+        draft.emit(Choose(run.id, Subject.ACTION, primitive.name, primitive.alternatives))
+    return draft.find(run.id) or run
+
+
+def _start(draft: Draft, run: Run) -> bool:
+    """Start the run if its device is free; True if the runtime ended it because the device is fenced for good."""
+    holders = [] if run.at_once or not run.device else _holders(draft, run)
+    if any(h.phase is Phase.STUCK for h in holders):
+        cause = f"{run.device} is fenced: {holders[0].id} could not be stopped"
+        end_run(draft, run, RunEnded(run.id, Status.ERROR, "device_fenced", cause, Executed.NO))
+        return True
+    if holders:
+        return False
+    arguments = {name: _argument(draft, value) for name, value in draft.compiled.task.places[run.place].args.items()}
+    draft.put(run, phase=Phase.STARTING, arguments=arguments)
+    primitive = draft.compiled.primitives[run.place]
+    draft.emit(StartRun(run.id, run.place, primitive.name, run.action, arguments, primitive.deadline))
+    return False
+
+
+def _holders(draft: Draft, run: Run) -> list[Run]:
+    """Other runs that have the run's device."""
+    going = [r for runs in draft.tokens.values() for r in runs if r.phase in ACTIVE]
+    return [r for r in (*going, *draft.stopping.values()) if r.device == run.device and r.id != run.id]
+
+
+def _argument(draft: Draft, value: Value) -> Value:
+    return draft.variables.get(value.variable) if isinstance(value, Reference) else value

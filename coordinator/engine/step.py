@@ -1,0 +1,245 @@
+"""From a stimulus to a stable marking: maximal steps, breakpoints, admission of runs, and the end of the mission run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from coordinator.conditions import ConditionFault
+from coordinator.engine.conflicts import Draw, choose_step
+from coordinator.engine.draft import Draft
+from coordinator.engine.firing import Match, cancel, fire, forget_flags, token_enabled, verdict_variables
+from coordinator.engine.instructions import (
+    Choose,
+    Finished,
+    HoldRun,
+    Paused,
+    ReleaseRun,
+    Resumed,
+    Severity,
+    Subject,
+)
+from coordinator.engine.runs import admit
+from coordinator.engine.state import ACTIVE, UNSTARTED, Mode, Phase, Run, Suspended
+from coordinator.engine.timers import disarm_all, hold_timers, refresh_timers, release_timers
+from coordinator.task import Counts, End, Status
+
+MOVING = frozenset({Mode.RUNNING, Mode.STEPPING})
+
+
+@dataclass(frozen=True, slots=True)
+class Policy:
+    """How the engine treats tasks that do not behave."""
+
+    firing_limit: int = 1000
+    """Firings without time after which it pauses."""
+    end_when_dead: bool = True
+    """End in ERROR when nothing can ever happen again; else only report it and leave it to the operator."""
+
+
+def settle(draft: Draft, policy: Policy, cause: str, pulse: str = "", step: Suspended | None = None) -> None:
+    """Fire what the stimulus made fireable (or go on with a suspended step), then until stable, then start runs."""
+    if draft.mode in MOVING and draft.suspended is None:
+        current = step or Suspended(pulse, cause)
+        while True:
+            _fire_until_stable(draft, policy, current)
+            if draft.mode not in MOVING or draft.suspended is not None or not admit(draft):
+                break
+            current = Suspended("", "stability")
+    elif draft.mode is Mode.PAUSED:
+        admit(draft)
+    if draft.flags:
+        forget_flags(draft)
+    if draft.retime and draft.mode is not Mode.FINISHED:
+        refresh_timers(draft)
+    _explain_waiting(draft)
+    _end_if_over(draft, policy)
+
+
+def pause(draft: Draft, reason: str) -> None:
+    """Nothing fires or starts from now on; running actions are asked to hold."""
+    draft.mode = Mode.PAUSED
+    draft.emit(Paused(reason))
+    for run in draft.live():
+        if run.phase in UNSTARTED:
+            draft.put(run, cleared=False)
+        elif run.phase is not Phase.HELD:
+            draft.emit(HoldRun(run.id))
+    hold_timers(draft)
+
+
+def resume(draft: Draft, mode: Mode) -> None:
+    """Go on, without end or for one firing."""
+    draft.mode = mode
+    draft.emit(Resumed(1 if mode is Mode.STEPPING else 0))
+    for run in draft.live():
+        if run.phase in UNSTARTED and not run.cleared:
+            draft.put(run, cleared=True)
+    if mode is Mode.RUNNING:
+        release(draft)
+    draft.touch_all()
+
+
+def release(draft: Draft) -> None:
+    """Held runs and timers go on."""
+    for run in draft.live():
+        if run.phase in ACTIVE:
+            draft.emit(ReleaseRun(run.id))
+        if run.phase is Phase.HELD:
+            draft.put(run, phase=Phase.RUNNING)
+    release_timers(draft)
+
+
+def abort(draft: Draft, reason: str) -> None:
+    """Cancel every run; the mission run ends when all have stopped."""
+    draft.mode, draft.suspended, draft.ending = Mode.ABORTING, None, f"aborted: {reason}" if reason else "aborted"
+    draft.backlog.clear()
+    for run in draft.live():
+        cancel(draft, run, Counts.NONE, draft.ending)
+    disarm_all(draft)
+
+
+def _fire_until_stable(draft: Draft, policy: Policy, current: Suspended) -> None:
+    while True:
+        step = choose_step(draft, current.pulse, current.choices, current.only)
+        if isinstance(step, Draw):
+            _ask(draft, current, step)
+            return
+        if not step or _breaks(draft, current, step):
+            return
+        limit = 1 if draft.mode is Mode.STEPPING else len(step)
+        entered = draft.run_order, draft.snapshot()
+        for fireable in step[:limit]:
+            fire(draft, fireable, current.cause)
+        if draft.mode is Mode.STEPPING:
+            _end_single_step(draft, current, step)
+        elif not _stops_after(draft, policy, entered[1], step):
+            current = Suspended("", "stability")
+            continue
+        return
+
+
+def _ask(draft: Draft, current: Suspended, draw: Draw) -> None:
+    key = f"conflict#{draft.stimuli}.{len(current.choices)}"
+    draft.suspended = Suspended(
+        current.pulse,
+        current.cause,
+        current.choices,
+        key,
+        draw.alternatives,
+        draw.weights,
+        current.passed,
+        current.only,
+    )
+    draft.emit(Choose(key, Subject.CONFLICT, ", ".join(draw.alternatives), draw.alternatives, draw.weights))
+
+
+def _breaks(draft: Draft, current: Suspended, step: list[Match]) -> bool:
+    """Pause before a transition with a breakpoint; its step waits."""
+    names = [m.exit.name for m in step]
+    hit = [n for n in names if n in draft.breakpoints and n not in current.passed]
+    if not hit:
+        return False
+    draft.suspended = Suspended(current.pulse, current.cause, current.choices, passed=tuple(names), only=current.only)
+    pause(draft, f"breakpoint before {hit[0]}")
+    return True
+
+
+def _end_single_step(draft: Draft, current: Suspended, step: list[Match]) -> None:
+    """One transition has fired; what its pulse would still serve waits for the next step."""
+    left = tuple(m.exit.name for m in step[1:] if m.exit.pulse)
+    if left:
+        draft.suspended = Suspended(current.pulse, current.cause, passed=current.passed, only=left)
+    draft.mode = Mode.PAUSED
+    draft.emit(Paused("step"))
+    admit(draft)
+
+
+def _stops_after(draft: Draft, policy: Policy, before: tuple[int, ...], step: list[Match]) -> bool:
+    """Pause after a token entered a place with a breakpoint, or when firings take no end."""
+    places = draft.compiled.net.places
+    entered = [places[p] for m in step for p, _, _ in m.exit.produce if places[p] in draft.breakpoints]
+    if entered:
+        pause(draft, f"breakpoint at {entered[0]}")
+        return True
+    if draft.timeless >= policy.firing_limit:
+        text = f"{draft.timeless} transitions fired without time passing, last {step[-1].exit.name}"
+        draft.report(Severity.ERROR, "timeless", text, step[-1].exit.name)
+        pause(draft, "firings without time")
+        return True
+    return False
+
+
+def _explain_waiting(draft: Draft) -> None:
+    """Runs that are done and whose every exit has a false condition have nowhere to go: say so once."""
+    if draft.mode not in MOVING or draft.suspended is not None:
+        return
+    for runs in draft.tokens.values():
+        for run in runs:
+            if run.phase is Phase.DONE and run.id not in draft.told and _nowhere_to_go(draft, run):
+                how = f"{run.status}{', ' + run.cause if run.cause else ''}"
+                text = f"{run.id} has finished ({how}) and has nowhere to go: the conditions of all its exits are false"
+                draft.report_once(Severity.ERROR, "nowhere_to_go", text, run.id)
+
+
+def _nowhere_to_go(draft: Draft, run: Run) -> bool:
+    wanted = End.ERROR if run.status is Status.ERROR else End.NORMAL
+    values = draft.variables | verdict_variables(run)
+    for x in draft.compiled.exits:
+        if not any(a.name == run.place and (a.end is wanted or a.takes_done) for a in x.actions) or x.never:
+            continue
+        try:
+            if x.when is None or x.pulse or x.flags or x.when.holds(values):
+                return False
+        except ConditionFault:
+            continue
+    return True
+
+
+class _Tokens(Mapping[str, int]):
+    """The marking by place name, as `final` reads it."""
+
+    def __init__(self, draft: Draft) -> None:
+        self.draft = draft
+
+    def __getitem__(self, name: str) -> int:
+        return self.draft.marking[self.draft.compiled.net.place_index[name]]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.draft.compiled.net.places)
+
+    def __len__(self) -> int:
+        return len(self.draft.marking)
+
+
+def _end_if_over(draft: Draft, policy: Policy) -> None:
+    if draft.suspended is not None or any(r.phase is not Phase.STUCK for r in draft.stopping.values()):
+        return
+    if draft.mode is Mode.ABORTING:
+        _finish(draft, Status.ERROR, draft.ending)
+    elif draft.mode in MOVING and not draft.live():
+        task, tokens = draft.compiled.task, _Tokens(draft)
+        if task.final.holds(tokens):
+            _finish(draft, Status.SUCCESS, f"final marking reached: {task.final}")
+        elif task.final_error is not None and task.final_error.holds(tokens):
+            _finish(draft, Status.ERROR, f"given up: {task.final_error}")
+        else:
+            _end_if_dead(draft, policy)
+
+
+def _end_if_dead(draft: Draft, policy: Policy) -> None:
+    if draft.timers or any(token_enabled(draft, x) for x in draft.compiled.exits):
+        return
+    text = f"no transition can ever fire again in {draft.compiled.net.describe(draft.snapshot())}, which is not final"
+    draft.report_once(Severity.ERROR, "dead", text, "dead")
+    if policy.end_when_dead:
+        _finish(draft, Status.ERROR, text)
+
+
+def _finish(draft: Draft, status: Status, reason: str) -> None:
+    fenced = sorted(draft.stopping)
+    if fenced:
+        status, reason = Status.ERROR, f"{reason}; {', '.join(fenced)} could not be stopped"
+    disarm_all(draft)
+    draft.mode, draft.ending = Mode.FINISHED, reason
+    draft.emit(Finished(status, reason, dict(draft.variables)))

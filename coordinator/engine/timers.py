@@ -1,0 +1,80 @@
+"""`after` timers: armed while the arcs of their transition are satisfied by the same runs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from coordinator.engine.compiled import Exit
+from coordinator.engine.draft import Draft
+from coordinator.engine.firing import arcs_satisfied, disarm
+from coordinator.engine.instructions import ArmTimer, HoldTimer, ReleaseTimer
+from coordinator.engine.state import ACTIVE, Mode, Timer
+
+
+def refresh_timers(draft: Draft) -> None:
+    """Arm and disarm what the changes of this stimulus call for."""
+    for t in sorted(draft.retime):
+        x = draft.compiled.exits[t]
+        taken = arcs_satisfied(draft, x)
+        runs = None if taken is None else tuple(r.id for r in taken)
+        timer = draft.timers.get(x.name)
+        if timer is not None and timer.runs != runs:
+            disarm(draft, x.name)
+            timer = None
+        if timer is None and runs is not None:
+            _arm(draft, x, runs)
+    draft.retime.clear()
+
+
+def disarm_all(draft: Draft) -> None:
+    """The mission run is over."""
+    for name in list(draft.timers):
+        disarm(draft, name)
+
+
+def hold_timers(draft: Draft) -> None:
+    """The net is paused: timers stop, but for those of runs that have not said yet whether they hold."""
+    for name, timer in list(draft.timers.items()):
+        if not timer.held and not timer.elapsed and not _concerns_active(draft, timer):
+            draft.timers[name] = replace(timer, held=True)
+            draft.emit(HoldTimer(timer.key))
+
+
+def release_timers(draft: Draft) -> None:
+    """The net goes on."""
+    for name, timer in list(draft.timers.items()):
+        if timer.held:
+            draft.timers[name] = replace(timer, held=False)
+            draft.emit(ReleaseTimer(timer.key))
+
+
+def elapse(draft: Draft, key: str) -> bool:
+    """Mark a timer as over; False if it is not wanted any more."""
+    for name, timer in draft.timers.items():
+        if timer.key == key:
+            draft.timers[name] = replace(timer, elapsed=True, held=False)
+            draft.dirty.add(draft.compiled.net.transition_index[name])
+            return True
+    return False
+
+
+def hold_timers_of(draft: Draft, run_id: str) -> None:
+    """A run is held: its timers stop."""
+    for name, timer in list(draft.timers.items()):
+        if run_id in timer.runs and not timer.held and not timer.elapsed:
+            draft.timers[name] = replace(timer, held=True)
+            draft.emit(HoldTimer(timer.key))
+
+
+def _arm(draft: Draft, x: Exit, runs: tuple[str, ...]) -> None:
+    draft.timer_order += 1
+    timer = Timer(f"{x.name}#{draft.timer_order}", runs)
+    draft.timers[x.name] = timer
+    draft.emit(ArmTimer(timer.key, x.name, x.after or 0.0))
+    if draft.mode is Mode.PAUSED and not _concerns_active(draft, timer):
+        draft.timers[x.name] = replace(timer, held=True)
+        draft.emit(HoldTimer(timer.key))
+
+
+def _concerns_active(draft: Draft, timer: Timer) -> bool:
+    return any((run := draft.find(i)) is not None and run.phase in ACTIVE for i in timer.runs)

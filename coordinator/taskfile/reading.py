@@ -1,0 +1,250 @@
+"""TOML to task. All faults are found in one pass and raised together."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from coordinator.conditions import ConditionError, Expression, parse
+from coordinator.consistency import faults as task_faults
+from coordinator.task import (
+    Early,
+    Estimate,
+    Event,
+    Inhibitor,
+    Input,
+    Kind,
+    Memory,
+    Output,
+    Place,
+    PrimitiveTask,
+    Reference,
+    Scope,
+    Start,
+    Status,
+    Subnet,
+    Task,
+    Transition,
+    Value,
+    Variable,
+    VariableType,
+)
+from coordinator.taskfile.arcs import ArcError, read_input, read_output
+from coordinator.taskfile.errors import TaskFileError, key_lines, line_of
+from coordinator.taskfile.table import Table
+from coordinator.wording import Fault
+
+SCHEMA = 1
+LARGEST = 4 << 20
+
+
+def load(path: str | Path) -> Task:
+    """The task in a file. Raises TaskFileError with every fault."""
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        fault = Fault("file", f"cannot be read: {error.strerror}", "check the path and its permissions")
+        raise TaskFileError(str(path), [fault], [0]) from error
+    if len(data) > LARGEST:
+        raise TaskFileError(str(path), [Fault("file", f"{len(data)} bytes", f"a task has at most {LARGEST}")], [0])
+    try:
+        text = data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        line = data[: error.start].count(b"\n") + 1
+        raise TaskFileError(str(path), [Fault("file", "is not UTF-8", "save it as UTF-8")], [line]) from error
+    return loads(text, str(path))
+
+
+def loads(text: str, source: str = "task") -> Task:
+    """The task in a TOML text; `source` names it in errors. Raises TaskFileError with every fault."""
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise TaskFileError(source, [Fault("TOML", str(error), "see toml.io for the syntax")], [0]) from error
+    except RecursionError as error:
+        raise TaskFileError(source, [Fault("TOML", "nested too deeply", "flatten it")], [0]) from error
+    faults: list[Fault] = []
+    task = _task(Table(data, "", faults))
+    found = faults or list(task_faults(task))
+    if found:
+        lines = key_lines(text)
+        raise TaskFileError(source, found, [line_of(f.key, lines) for f in found])
+    return task
+
+
+def _task(root: Table) -> Task:
+    schema = root.any("schema")
+    if schema != SCHEMA or isinstance(schema, bool):
+        root.fault("schema", f"{schema!r} is not known here", f"write schema = {SCHEMA}")
+    head = root.table("task")
+    task = Task(
+        name=head.text("name"),
+        text=head.text("text", ""),
+        goal=head.text("goal", ""),
+        goal_transitions=head.texts("goal_transitions"),
+        final=_condition(head, "final") or parse("false"),
+        final_error=_condition(head, "final_error") if "final_error" in head.data else None,
+        runs_place=head.text("runs_place", ""),
+        prepare=head.text("prepare", ""),
+        score=head.text("score", ""),
+        parameters=head.plain("parameters"),
+        primitive_tasks={n: _primitive_task(n, t) for n, t in root.tables("primitive_tasks").items()},
+        variables={n: _variable(n, t) for n, t in root.tables("variables").items()},
+        events={n: _event(n, t) for n, t in root.tables("events").items()},
+        places={n: _place(n, t) for n, t in root.tables("places").items()},
+        transitions={n: _transition(n, t) for n, t in root.tables("transitions").items()},
+        subnets={n: _subnet(n, t) for n, t in root.tables("subnets").items()},
+    )
+    head.any("final_error")
+    head.done()
+    root.done()
+    return task
+
+
+def _primitive_task(name: str, t: Table) -> PrimitiveTask:
+    primitive = PrimitiveTask(
+        name=name,
+        goal=t.text("goal"),
+        specification=t.text("specification", ""),
+        alternatives=t.texts("alternatives"),
+        deadline=t.number("deadline"),
+        target_reliability=t.number("target_reliability", 0.9),
+        cost=t.text("cost", "wall"),
+        error_causes=_texts(t.table("error_causes")),
+        start=t.word("start", Start, Start.WHEN_FREE),
+        stop_within=t.number("stop_within", 2.0),
+        estimates=_estimates(t),
+    )
+    t.done()
+    return primitive
+
+
+def _texts(t: Table) -> dict[str, str]:
+    return {name: t.text(name) for name in t.data}
+
+
+def _estimates(t: Table) -> dict[Status, Estimate]:
+    table = t.table("estimates")
+    estimates: dict[Status, Estimate] = {}
+    for status in Status:
+        if status.value in table.data:
+            e = table.table(status.value)
+            estimates[status] = Estimate(e.number("share"), e.number("mean"), e.number("cv", 1.0))
+            e.done()
+    table.done()
+    return estimates
+
+
+def _variable(name: str, t: Table) -> Variable:
+    variable = Variable(name, t.word("type", VariableType), t.any("initial"), t.texts("values"))
+    t.done()
+    return variable
+
+
+def _event(name: str, t: Table) -> Event:
+    event = Event(
+        name=name,
+        scope=t.word("scope", Scope),
+        memory=t.word("memory", Memory, Memory.PULSE),
+        early=t.word("early", Early, Early.DROP),
+        by=t.text("by", ""),
+        mean_wait=t.maybe_number("mean_wait"),
+        text=t.text("text", ""),
+    )
+    t.done()
+    return event
+
+
+def _place(name: str, t: Table) -> Place:
+    place = Place(
+        name=name,
+        kind=t.word("kind", Kind),
+        tokens=t.integer("tokens", 0),
+        capacity=t.maybe_integer("capacity"),
+        task=t.text("task", ""),
+        args={n: _argument(v) for n, v in t.plain("args").items()},
+        out=_texts(t.table("out")),
+        servers=t.maybe_integer("servers"),
+        subnet=t.text("subnet", ""),
+        label=t.text("label", ""),
+        x=t.maybe_number("x"),
+        y=t.maybe_number("y"),
+    )
+    t.done()
+    return place
+
+
+def _argument(value: Any) -> Value:
+    if isinstance(value, dict) and set(value) == {"var"} and isinstance(value["var"], str):
+        return Reference(value["var"])
+    return value
+
+
+def _transition(name: str, t: Table) -> Transition:
+    arcs = _inputs(t)
+    transition = Transition(
+        name=name,
+        inputs=tuple(a for a in arcs if isinstance(a, Input)),
+        inhibitors=tuple(a for a in arcs if isinstance(a, Inhibitor)),
+        outputs=_outputs(t),
+        events=t.texts("event", single=True),
+        when=_condition(t, "when") if "when" in t.data else None,
+        priority=t.integer("priority", 0),
+        weight=t.maybe_number("weight"),
+        after=t.maybe_number("after"),
+        error_branch=t.flag("error_branch"),
+        label=t.text("label", ""),
+        x=t.maybe_number("x"),
+        y=t.maybe_number("y"),
+    )
+    t.any("when")
+    t.done()
+    return transition
+
+
+def _inputs(t: Table) -> list[Input | Inhibitor]:
+    arcs: list[Input | Inhibitor] = []
+    for text in t.texts("in"):
+        try:
+            arcs.append(read_input(text))
+        except ArcError as error:
+            t.fault("in", str(error))
+    return arcs
+
+
+def _outputs(t: Table) -> tuple[Output, ...]:
+    arcs: list[Output] = []
+    for text in t.texts("out"):
+        try:
+            arcs.append(read_output(text))
+        except ArcError as error:
+            t.fault("out", str(error))
+    return tuple(arcs)
+
+
+def _condition(t: Table, name: str) -> Expression | None:
+    text = t.text(name)
+    if not text:
+        if name in t.data and isinstance(t.data[name], str):
+            t.fault(name, "an empty condition", "write one, or drop the key")
+        return None
+    try:
+        return parse(text)
+    except ConditionError as error:
+        t.fault(name, str(error))
+        return None
+
+
+def _subnet(name: str, t: Table) -> Subnet:
+    subnet = Subnet(
+        name=name,
+        places={n: _place(n, p) for n, p in t.tables("places").items()},
+        transitions={n: _transition(n, p) for n, p in t.tables("transitions").items()},
+        entry=t.text("entry"),
+        normal=t.text("normal"),
+        error=t.text("error", ""),
+    )
+    t.done()
+    return subnet
