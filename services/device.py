@@ -27,6 +27,11 @@ class Setpoint(Protocol):
         """Seconds since the newest one arrived (inf before the first)."""
 
     @property
+    def held(self) -> float:
+        """Seconds since its sender first sent these values (inf before the first), but for their way here: a repeat makes
+        them no younger. What a value that means "from now on" must be reduced by; never less than `age`."""
+
+    @property
     def count(self) -> int:
         """How many have arrived."""
 
