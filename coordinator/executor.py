@@ -7,13 +7,13 @@ callers. Every stimulus is handed to the store before its effects leave, and eff
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 
-from coordinator.engine import Engine
+from coordinator.engine import Engine, State
 from coordinator.engine.instructions import (
     ArmTimer,
     CancelRun,
@@ -54,6 +54,10 @@ STILL_FENCED = frozenset({"lost", "no_answer", "not_accepted"})
 """Causes after which a device may still be moving: its node has not said that the run is over."""
 
 
+_TOUCHES_THE_WORLD = (StartRun, CancelRun, HoldRun, ReleaseRun)
+"""Effects that leave this process: what led to them is made safe first."""
+
+
 class Selector(Protocol):
     """Chooses among the alternatives of a primitive task."""
 
@@ -64,11 +68,15 @@ class Selector(Protocol):
 class Store(Protocol):
     """Where stimuli go before their effects leave."""
 
-    def append(self, now: float, stimulus: Stimulus) -> None:
-        """Keep a stimulus with the next sync."""
+    def append(self, now: float, stimulus: Stimulus, instructions: Sequence[Instruction], state: State) -> None:
+        """Keep a stimulus, and what came of it, with the next sync."""
 
     def sync(self) -> None:
         """Make all that was appended safe."""
+
+    @property
+    def safe(self) -> bool:
+        """Whether nothing waits for a sync."""
 
 
 class Observer(Protocol):
@@ -87,7 +95,9 @@ class Observer(Protocol):
 class Forgetful:
     """The store of a run without a journal."""
 
-    def append(self, now: float, stimulus: Stimulus) -> None:
+    safe = True
+
+    def append(self, now: float, stimulus: Stimulus, instructions: Sequence[Instruction], state: State) -> None:
         """Keep nothing."""
 
     def sync(self) -> None:
@@ -213,20 +223,21 @@ class Executor:
         while self._queue:
             while self._queue:
                 self._handle(now, self._queue.popleft())
-            if self._effects or self._acks:
+            if self.finished is not None or any(isinstance(effect, _TOUCHES_THE_WORLD) for effect in self._effects):
                 self.store.sync()
             effects, self._effects = self._effects, []
             for instruction in effects:
                 self._carry_out[type(instruction)](now, instruction)
-            acks, self._acks = self._acks, []
-            for acknowledge in acks:
-                acknowledge()
+            if self.store.safe:
+                acks, self._acks = self._acks, []
+                for acknowledge in acks:
+                    acknowledge()
 
     def _handle(self, now: float, stimulus: Stimulus) -> None:
-        self.store.append(now, stimulus)
         for observer in self.observers:
             observer.stimulus(now, stimulus)
         self.state, instructions = self.engine.handle(self.state, stimulus)
+        self.store.append(now, stimulus, instructions, self.state)
         for instruction in instructions:
             for observer in self.observers:
                 observer.instruction(now, instruction)
