@@ -19,7 +19,6 @@ from coordinator.engine.instructions import (
     Report,
     Resumed,
     RunRecorded,
-    Severity,
     StartRun,
     Subject,
 )
@@ -53,6 +52,7 @@ from coordinator.engine.stimuli import (
     VariableChanged,
     Verdict,
 )
+from coordinator.wording import Severity
 
 __all__ = [
     "OPERATOR",

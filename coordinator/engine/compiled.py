@@ -35,6 +35,8 @@ class Exit:
     plain: Arcs
     """Inputs from resource and control places."""
     actions: tuple[ActionArc, ...]
+    takes: Arcs
+    """All inputs: what the ordinary net consumes."""
     inhibit: Arcs
     produce: tuple[tuple[int, int, bool], ...]
     """(place, weight, is action place)."""
@@ -136,6 +138,7 @@ def _exit(task: Task, net: Net, t: Transition) -> Exit:
         name=t.name,
         plain=plain,
         actions=actions,
+        takes=net.consume[index],
         inhibit=net.inhibit[index],
         produce=tuple((p, w, places[p].kind is Kind.ACTION) for p, w in sorted(produced.items())),
         room=tuple((p, g, limit) for p, g in gains.items() if g > 0 and (limit := limits[p]) is not None),

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from coordinator.engine.draft import Draft
 from coordinator.engine.firing import Claims, Match, eligible_runs, match
-from coordinator.engine.instructions import Severity
 from coordinator.task import End
+from coordinator.wording import Severity
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,4 +130,4 @@ def _scarce(draft: Draft, rest: list[Match], claims: Claims) -> set[tuple[int, s
 def _report(draft: Draft, contest: list[Match]) -> None:
     names = ", ".join(m.exit.name for m in contest)
     text = f"nothing settles the conflict of {names}; {contest[0].exit.name} fires, being first in the file"
-    draft.report(Severity.ERROR, "undecided", text, names)
+    draft.report(Severity.WARNING, "undecided", text, names)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from coordinator.engine.compiled import Compiled
-from coordinator.engine.instructions import Instruction, Report, Severity
+from coordinator.engine.instructions import Instruction, Report
 from coordinator.engine.state import LIVE, Mode, Phase, Run, State
 from coordinator.net import Marking
 from coordinator.task import Value
+from coordinator.wording import Severity
 
 
 class Draft:
@@ -145,11 +144,17 @@ class Draft:
 
     def put(self, old: Run, **changes: object) -> Run:
         """Replace a run by a changed one, wherever it is kept."""
-        new = replace(old, **changes)  # type: ignore[arg-type]
-        if old.id in self.stopping:
-            self.stopping[old.id] = new
-        else:
-            self.tokens[old.place] = tuple(new if r.id == old.id else r for r in self.tokens[old.place])
-        place = self.compiled.action_places[old.place]
-        self.touch(place)
+        new = old.changed(**changes)
+        self.replace_run(new)
         return new
+
+    def replace_run(self, new: Run) -> None:
+        """Put a changed run in the place of the one with its id."""
+        if new.id in self.stopping:
+            self.stopping[new.id] = new
+        else:
+            present = self.tokens[new.place]
+            self.tokens[new.place] = (
+                (new,) if len(present) == 1 else tuple(new if r.id == new.id else r for r in present)
+            )
+        self.touch(self.compiled.action_places[new.place])

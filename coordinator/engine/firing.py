@@ -9,9 +9,10 @@ from typing import NamedTuple
 from coordinator.conditions import ConditionFault
 from coordinator.engine.compiled import ActionArc, Exit
 from coordinator.engine.draft import Draft
-from coordinator.engine.instructions import CancelRun, DisarmTimer, Fired, Severity
+from coordinator.engine.instructions import CancelRun, DisarmTimer, Fired
 from coordinator.engine.state import ACTIVE, LIVE, Phase, Run
 from coordinator.task import Counts, End, Status, Value
+from coordinator.wording import Severity
 
 
 class Match(NamedTuple):
@@ -61,20 +62,22 @@ _NOTHING = Claims()
 
 def match(draft: Draft, x: Exit, pulse: str, claims: Claims = _NOTHING) -> Match | None:
     """How the transition can fire beside what was claimed, with the pulse that has just come; None if it cannot."""
-    if x.pulse != pulse and x.pulse:
+    if (x.pulse and x.pulse != pulse) or x.never or not _marking_allows(draft, x, claims):
         return None
-    if x.never or not _marking_allows(draft, x, claims):
-        return None
-    if any(f not in draft.flags or f in claims.flags for f in x.flags):
-        return None
+    for f in x.flags:
+        if f not in draft.flags or f in claims.flags:
+            return None
     if x.after is not None and not ((timer := draft.timers.get(x.name)) and timer.elapsed):
         return None
-    eligible = [eligible_runs(draft, arc, claims) for arc in x.actions]
-    if any(len(runs) < arc.weight for arc, runs in zip(x.actions, eligible, strict=True)):
-        return None
-    for runs in _selections(x, eligible):
-        if x.when is None or _condition_holds(draft, x, runs):
-            return Match(x, runs)
+    eligible: list[list[Run]] = []
+    for arc in x.actions:
+        runs = eligible_runs(draft, arc, claims)
+        if len(runs) < arc.weight:
+            return None
+        eligible.append(runs)
+    for selection in _selections(x, eligible):
+        if x.when is None or _condition_holds(draft, x, selection):
+            return Match(x, selection)
     return None
 
 
@@ -90,8 +93,7 @@ def arcs_satisfied(draft: Draft, x: Exit) -> tuple[Run, ...] | None:
 
 def token_enabled(draft: Draft, x: Exit) -> bool:
     """Whether tokens, inhibitors and room enable the transition in the ordinary sense, whatever its runs do."""
-    marking = draft.marking
-    return _marking_allows(draft, x, _NOTHING) and all(marking[a.place] >= a.weight for a in x.actions)
+    return _marking_allows(draft, x, _NOTHING)
 
 
 def eligible_runs(draft: Draft, arc: ActionArc, claims: Claims, heard: bool = True) -> list[Run]:
@@ -184,13 +186,13 @@ def awaited(draft: Draft, event: str) -> bool:
 
 def _marking_allows(draft: Draft, x: Exit, claims: Claims) -> bool:
     marking, used = draft.marking, claims.used
-    for p, w in x.plain:
+    for p, w in x.takes:
         if marking[p] - used.get(p, 0) < w:
             return False
     for p, k in x.inhibit:
         if draft.occupied(p) + claims.change.get(p, 0) >= k:
             return False
-    return not any(draft.occupied(p) + claims.change.get(p, 0) + gain > limit for p, gain, limit in x.room)
+    return not x.room or all(draft.occupied(p) + claims.change.get(p, 0) + gain <= limit for p, gain, limit in x.room)
 
 
 def _fits(arc: ActionArc, run: Run) -> bool:

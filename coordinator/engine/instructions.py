@@ -8,6 +8,7 @@ from enum import StrEnum
 
 from coordinator.net import Marking
 from coordinator.task import Counts, Executed, Status, Value
+from coordinator.wording import Severity
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,14 +150,6 @@ class Corrected:
     was: Status
     status: Status
     cause: str = ""
-
-
-class Severity(StrEnum):
-    """How much a report matters."""
-
-    NOTE = "note"
-    WARNING = "warning"
-    ERROR = "error"
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,6 @@ from coordinator.engine.instructions import (
     HoldRun,
     HoldTimer,
     Instruction,
-    Severity,
     StartRun,
     Subject,
 )
@@ -49,6 +48,7 @@ from coordinator.engine.stimuli import (
 )
 from coordinator.engine.timers import elapse, hold_timers_of
 from coordinator.task import Counts, Memory, Scope, Task, VariableType
+from coordinator.wording import Severity
 
 _AFTER_THE_END = (RunEnded, StopConfirmed, StopFailed, Verdict)
 _ALWAYS_HEARD = (Abort, Verdict, SetBreakpoints)

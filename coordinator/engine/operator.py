@@ -6,12 +6,12 @@ from dataclasses import replace
 
 from coordinator.engine.draft import Draft
 from coordinator.engine.firing import Match, arcs_satisfied, fire, forget_flags
-from coordinator.engine.instructions import Marked, Severity
+from coordinator.engine.instructions import Marked
 from coordinator.engine.state import LIVE, Mode, Phase, Run
 from coordinator.engine.step import MOVING, Policy, pause, release, resume, settle
 from coordinator.engine.stimuli import AddTokens, ForceExit, RemoveTokens, SetBreakpoints
 from coordinator.task import Counts, End, Kind
-from coordinator.wording import nearest
+from coordinator.wording import Severity, nearest
 
 
 def add_tokens(draft: Draft, policy: Policy, command: AddTokens) -> None:
@@ -138,7 +138,8 @@ def _forced_runs(draft: Draft, place: str, end: End) -> list[Run]:
 
 def _others_allow(draft: Draft, index: int) -> bool:
     """Whether plain inputs, inhibitors and room allow the forced exit."""
-    return arcs_satisfied(draft, replace(draft.compiled.exits[index], actions=())) is not None
+    x = draft.compiled.exits[index]
+    return arcs_satisfied(draft, replace(x, actions=(), takes=x.plain)) is not None
 
 
 def _fire_forced(draft: Draft, forced: Match) -> None:

@@ -6,10 +6,11 @@ from dataclasses import replace
 
 from coordinator.engine.draft import Draft
 from coordinator.engine.firing import verdict_variables
-from coordinator.engine.instructions import Choose, Corrected, RunRecorded, Severity, StartRun, Subject
+from coordinator.engine.instructions import Choose, Corrected, RunRecorded, StartRun, Subject
 from coordinator.engine.state import ACTIVE, UNSTARTED, Deferred, Phase, Run
 from coordinator.engine.stimuli import RunEnded, StopConfirmed, StopFailed, Verdict
 from coordinator.task import Counts, Executed, Reference, Start, Status, Value
+from coordinator.wording import Severity
 
 
 def admit(draft: Draft) -> bool:
@@ -21,20 +22,27 @@ def admit(draft: Draft) -> bool:
     for run in sorted(waiting, key=lambda r: r.order) if len(waiting) > 1 else waiting:
         if not run.cleared:
             continue
-        current = run
-        if current.phase is Phase.QUEUED and _has_server(draft, current.place):
-            current = _choose(draft, current)
-        if current.phase is Phase.WAITING:
-            ended |= _start(draft, current)
+        if run.phase is Phase.WAITING:
+            ended |= _start(draft, run)
+        elif run.phase is Phase.QUEUED and _has_server(draft, run.place):
+            alternatives = draft.compiled.primitives[run.place].alternatives
+            if len(alternatives) == 1:
+                ended |= _start(draft, _translated(draft, run, alternatives[0]))
+            else:
+                _choose(draft, run, alternatives)
     return ended
 
 
 def chosen(draft: Draft, run: Run, action: str) -> None:
     """The action of a run is known; it waits for its device from now on."""
-    primitive = draft.compiled.primitives[run.place]
+    draft.replace_run(_translated(draft, run, action))
+
+
+def _translated(draft: Draft, run: Run, action: str) -> Run:
+    """The run with its action, before it has its device."""
+    at_once = draft.compiled.primitives[run.place].start is Start.AT_ONCE
     device = draft.compiled.devices.get(action, "")
-    at_once = primitive.start is Start.AT_ONCE
-    draft.put(run, phase=Phase.WAITING, action=action, device=device, at_once=at_once)
+    return run.changed(phase=Phase.WAITING, action=action, device=device, at_once=at_once)
 
 
 def end_run(draft: Draft, run: Run, end: RunEnded) -> None:
@@ -136,19 +144,16 @@ def _has_server(draft: Draft, place: str) -> bool:
     return going < (draft.compiled.task.places[place].servers or 1)
 
 
-def _choose(draft: Draft, run: Run) -> Run:
-    primitive = draft.compiled.primitives[run.place]
-    if len(primitive.alternatives) == 1:
-        chosen(draft, run, primitive.alternatives[0])
-    else:
-        draft.put(run, phase=Phase.CHOOSING)
-        draft.emit(Choose(run.id, Subject.ACTION, primitive.name, primitive.alternatives))
-    return draft.find(run.id) or run
+def _choose(draft: Draft, run: Run, alternatives: tuple[str, ...]) -> None:
+    draft.put(run, phase=Phase.CHOOSING)
+    draft.emit(Choose(run.id, Subject.ACTION, draft.compiled.primitives[run.place].name, alternatives))
 
 
 def _start(draft: Draft, run: Run) -> bool:
     """Start the run if its device is free; True if the runtime ended it because the device is fenced for good."""
     holders = [] if run.at_once or not run.device else _holders(draft, run)
+    if holders:
+        draft.replace_run(run)
     if any(h.phase is Phase.STUCK for h in holders):
         cause = f"{run.device} is fenced: {holders[0].id} could not be stopped"
         end_run(draft, run, RunEnded(run.id, Status.ERROR, "device_fenced", cause, Executed.NO))

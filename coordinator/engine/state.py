@@ -50,7 +50,7 @@ ACTIVE = frozenset({Phase.STARTING, Phase.RUNNING, Phase.HELD})
 LIVE = UNSTARTED | ACTIVE
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Run:
     """One execution of an action, from the token that entered its place until it is known to have stopped."""
 
@@ -76,6 +76,13 @@ class Run:
     """How it counts after its cancellation."""
     reason: str = ""
     """Why it was cancelled."""
+
+    def changed(self, **changes: object) -> Run:
+        """A copy with some fields changed. Like `dataclasses.replace`, at a fraction of its time: it is the hot path."""
+        copy = object.__new__(Run)
+        copy.__dict__.update(self.__dict__)
+        copy.__dict__.update(changes)
+        return copy
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,13 +16,13 @@ from coordinator.engine.instructions import (
     Paused,
     ReleaseRun,
     Resumed,
-    Severity,
     Subject,
 )
 from coordinator.engine.runs import admit
 from coordinator.engine.state import ACTIVE, UNSTARTED, Mode, Phase, Run, Suspended
 from coordinator.engine.timers import disarm_all, hold_timers, refresh_timers, release_timers
 from coordinator.task import Counts, End, Status
+from coordinator.wording import Severity
 
 MOVING = frozenset({Mode.RUNNING, Mode.STEPPING})
 

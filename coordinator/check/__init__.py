@@ -1,0 +1,40 @@
+"""Static check of a task: fast, without its state space. What the state space holds is for the analysis."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+
+from coordinator.check.branches import uncovered_exits
+from coordinator.check.conflicts import conflicts
+from coordinator.check.events import event_faults, external_waits
+from coordinator.check.findings import Finding, Report
+from coordinator.check.flow import never_marked, odd_ends, timeless_cycles, unused
+from coordinator.check.offers import unoffered
+from coordinator.consistency import faults
+from coordinator.task import Task
+from coordinator.wording import Severity
+
+__all__ = ["Finding", "Report", "Severity", "check"]
+
+_CHECKS: tuple[Callable[[Task], Iterator[Finding]], ...] = (
+    uncovered_exits,
+    event_faults,
+    conflicts,
+    timeless_cycles,
+    external_waits,
+    never_marked,
+    odd_ends,
+    unused,
+)
+_ORDER = (Severity.ERROR, Severity.WARNING, Severity.NOTE)
+
+
+def check(task: Task, offers: Mapping[str, str] | None = None) -> Report:
+    """Everything that can be said of the task without exploring it. `offers`: the node of each action that is offered."""
+    broken = faults(task)
+    if broken:
+        return Report(tuple(Finding(Severity.ERROR, "inconsistent", f.key, f.text, f.remedy) for f in broken))
+    found = [finding for part in _CHECKS for finding in part(task.flat)]
+    if offers is not None:
+        found += unoffered(task, offers)
+    return Report(tuple(sorted(found, key=lambda f: _ORDER.index(f.severity))))
