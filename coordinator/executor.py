@@ -32,6 +32,7 @@ from coordinator.engine.stimuli import (
     Chosen,
     EventOccurred,
     Hold,
+    Pause,
     RunEnded,
     RunHeld,
     RunRaised,
@@ -71,6 +72,9 @@ class Store(Protocol):
     def append(self, now: float, stimulus: Stimulus, instructions: Sequence[Instruction], state: State) -> None:
         """Keep a stimulus, and what came of it, with the next sync."""
 
+    def node(self, name: str, boot: str) -> None:
+        """Keep which boot of a node this run speaks to."""
+
     def sync(self) -> None:
         """Make all that was appended safe."""
 
@@ -98,6 +102,9 @@ class Forgetful:
     safe = True
 
     def append(self, now: float, stimulus: Stimulus, instructions: Sequence[Instruction], state: State) -> None:
+        """Keep nothing."""
+
+    def node(self, name: str, boot: str) -> None:
         """Keep nothing."""
 
     def sync(self) -> None:
@@ -161,6 +168,7 @@ class Executor:
         self._commands: dict[str, str] = {}
         self._acks: list[Callable[[], None]] = []
         self._command_count = 0
+        self._boots: Mapping[str, str] = {}
         self._external = {e.name for e in self.task.flat.events.values() if e.scope is Scope.EXTERNAL}
         self._carry_out: Mapping[type, Callable[[float, Instruction], None]] = {
             StartRun: self._start_run,
@@ -180,6 +188,56 @@ class Executor:
         names = sorted(self._external | {MEMORY_EVENTS + name for name in self.task.flat.variables})
         for caller in self.callers.values():
             caller.subscribe(now, names)
+
+    def adopt(self, now: float, state: State, boots: Mapping[str, str]) -> None:
+        """Go on from a state that another process left: ask nodes for its runs, give its orders again, restart its timers.
+
+        `boots` are the boots that the runs were sent to; a node of another boot answers `executed = unknown`.
+        """
+        self.state, self._boots = state, boots
+        for order in self.engine.outstanding(state):
+            if isinstance(order, Choose):
+                self._queue.append(self._choose(order))
+            elif isinstance(order, StartRun):
+                self._rejoin(now, order)
+            elif isinstance(order, CancelRun):
+                self._cancel_again(now, order)
+            elif type(order) in self._carry_out:
+                self._carry_out[type(order)](now, order)
+        self._work(now)
+
+    def relive(self, now: float, stimulus: Stimulus, instructions: Sequence[Instruction], state: State) -> None:
+        """Let observers see a step that was recorded earlier; nothing is carried out."""
+        self.state = state
+        for observer in self.observers:
+            observer.stimulus(now, stimulus)
+            for instruction in instructions:
+                observer.instruction(now, instruction)
+        self.finished = next((i for i in instructions if isinstance(i, Finished)), self.finished)
+
+    def _rejoin(self, now: float, start: StartRun) -> None:
+        """Ask for a run under its old id: the node goes on with it or gives its stored result."""
+        wish = self.directory.actions[start.action].on_resume if start.action in self.directory.actions else "rejoin"
+        self._start_run(now, start)
+        if wish == "error":
+            self._abandon(now, start)
+        elif wish == "ask":
+            self._queue.append(Pause(f"{start.action} was going on when the coordinator ended: go on with it?"))
+
+    def _abandon(self, now: float, start: StartRun) -> None:
+        flight = self._flights.pop(start.run)
+        self.callers[flight.node].cancel(now, self.call_id(start.run), "resumed")
+        if flight.device:
+            self._fences[flight.device] = now + (self.directory.actions[start.action].orphan_time or 0.0) + STOP_MARGIN
+        text = "the coordinator ended while it went on"
+        self._queue.append(RunEnded(start.run, Status.ERROR, "resumed", text, Executed.UNKNOWN))
+
+    def _cancel_again(self, now: float, cancel: CancelRun) -> None:
+        run = self.state.run(cancel.run)
+        if run is not None and run.action in self.directory.actions:
+            start = StartRun(run.id, run.place, "", run.action, run.arguments, cancel.within)
+            self._start_run(now, start)
+        self._cancel_run(now, cancel)
 
     def stimulate(self, now: float, *stimuli: Stimulus) -> None:
         """Take stimuli in, and let their effects leave."""
@@ -329,7 +387,8 @@ class Executor:
         flight.waits_for_fence = False
         start = flight.start
         arguments = {**self.directory.actions[start.action].args, **start.arguments}
-        call = Call(self.call_id(start.run), start.action, arguments, start.deadline, seed=self.seed)
+        boot = self._boots.get(flight.node, "")
+        call = Call(self.call_id(start.run), start.action, arguments, start.deadline, boot=boot, seed=self.seed)
         self.callers[flight.node].call(now, call)
 
     def _cancel_run(self, now: float, cancel: Instruction) -> None:

@@ -6,15 +6,17 @@ import importlib
 import secrets
 import socket
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from coordinator.engine import Engine
-from coordinator.executor import Executor, FirstAlternative, Selector
+from coordinator.executor import Executor, FirstAlternative, Forgetful, Observer, Selector, Store
+from coordinator.journal import Journal, JournalWriter
 from coordinator.lockstep_party import NAME, CoordinatorParty
 from coordinator.mission import Mission
+from coordinator.recording import EPOCH, JournalStore, boots, last_epoch, replay
 from coordinator.supervisor import Program, is_local, laboratory_program, node_program
 from coordinator.task import Task
 from services.comm.caller import Caller
@@ -48,26 +50,32 @@ def load_object(path: str) -> Any:
     return getattr(importlib.import_module(module), name)
 
 
-def prepared_task(setting: Setting) -> tuple[Task, int]:
-    """The task with its number of runs put into the runs place; gives that number too."""
-    task = setting.task
+def with_runs(task: Task, runs: int | None) -> tuple[Task, int]:
+    """The task with so many tokens in its runs place (None: as many as the file says); gives that number too."""
     place = task.places.get(task.runs_place) if task.runs_place else None
     if place is None:
         return task, 1
-    runs = place.tokens if setting.runs is None else setting.runs
+    runs = place.tokens if runs is None else runs
     capacity = None if place.capacity is None else max(place.capacity, runs)
     return replace(task, places={**task.places, place.name: replace(place, tokens=runs, capacity=capacity)}), runs
 
 
-def make_mission(directory: Directory, setting: Setting, mission: str, boot: str) -> Mission:
+def make_mission(
+    directory: Directory, setting: Setting, mission: str, boot: str, store: Store | None = None
+) -> Mission:
     """A mission run with a caller for each node of the directory."""
-    task, runs = prepared_task(setting)
-    hello = Hello(OLDEST_VERSION, NEWEST_VERSION, "coordinator", NAME, boot, 1, directory.hash)
-    callers = {node: Caller(node, hello) for node in directory.nodes}
+    task, runs = with_runs(setting.task, setting.runs)
+    callers = make_callers(directory, boot, 1)
     devices = {a.name: a.device for a in directory.actions.values() if a.device}
     engine = Engine(task, devices)
-    executor = Executor(task, engine, directory, callers, mission, setting.seed, setting.selector)
+    executor = Executor(task, engine, directory, callers, mission, setting.seed, setting.selector, store or Forgetful())
     return Mission(executor, {**task.parameters, **setting.parameters}, runs)
+
+
+def make_callers(directory: Directory, boot: str, epoch: int) -> dict[str, Caller]:
+    """A caller for each node, all introduced as the coordinator in this epoch."""
+    hello = Hello(OLDEST_VERSION, NEWEST_VERSION, "coordinator", NAME, boot, epoch, directory.hash)
+    return {node: Caller(node, hello) for node in directory.nodes}
 
 
 # --- lock step ---------------------------------------------------------------------------------------------------------
@@ -110,16 +118,47 @@ def lockstep_member(
     listener = socket.create_server(("127.0.0.1", 0))
     addresses = {node: directory.address(node) for node in directory.nodes} | {NAME: listener.getsockname()[:2]}
     delays = Delays(directory.delays())
-    return Member(NAME, [coordinator], addresses, delays=delays, directory=directory.hash, listener=listener), coordinator
+    return Member(
+        NAME, [coordinator], addresses, delays=delays, directory=directory.hash, listener=listener
+    ), coordinator
 
 
 # --- real time ---------------------------------------------------------------------------------------------------------
 
 
-def realtime_mission(directory: Directory, setting: Setting) -> Mission:
-    """A mission run with an id of its own: nodes never take its calls for those of an earlier one."""
-    stamp = time.strftime("%Y%m%d-%H%M%S")
-    return make_mission(directory, setting, f"{setting.task.name}-{stamp}-{secrets.token_hex(3)}", secrets.token_hex(8))
+def mission_id(task: Task) -> str:
+    """An id of its own for a mission run: nodes never take its calls for those of an earlier one."""
+    return f"{task.name}-{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(3)}"
+
+
+def realtime_mission(directory: Directory, setting: Setting, mission: str, store: Store | None = None) -> Mission:
+    """A mission run on the wall clock."""
+    return make_mission(directory, setting, mission, secrets.token_hex(8), store)
+
+
+def resumed_mission(
+    directory: Directory, task: Task, engine: Engine, journal: Journal, observers: Sequence[Observer]
+) -> tuple[Mission, Callable[[float], None]]:
+    """A mission run as its journal left it, and what makes it go on once the nodes are there.
+
+    Raises ReplayError when the engine does not derive what the journal says.
+    """
+    header = journal.header
+    writer = JournalWriter(journal.path)
+    epoch = last_epoch(journal) + 1
+    writer.append(EPOCH, {"epoch": epoch})
+    writer.sync()
+    steps = list(replay(journal, engine))
+    origin = time.monotonic() - (steps[-1].time if steps else 0.0)
+    callers = make_callers(directory, secrets.token_hex(8), epoch)
+    executor = Executor(
+        task, engine, directory, callers, header["mission"], header["seed"], store=JournalStore(writer, origin)
+    )
+    mission = Mission(executor, header["parameters"], header["runs"])
+    executor.observers.extend(observers)
+    for step in steps:
+        executor.relive(origin + step.time, step.stimulus, step.instructions, step.state)
+    return mission, lambda now: mission.resume(now, executor.state, boots(journal), origin)
 
 
 def local_programs(directory: Directory, *, lockstep: bool = False, source: Path | None = None) -> list[Program]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
+from coordinator.engine import State
 from coordinator.engine.instructions import Fired, Instruction, Report, RunRecorded, Severity, StartRun
 from coordinator.engine.stimuli import Begin, Stimulus
 from coordinator.executor import Executor
@@ -126,6 +127,12 @@ class Mission:
         else:
             self.stage = Stage.PREPARING
 
+    def resume(self, now: float, state: State, boots: Mapping[str, str], begun: float) -> None:
+        """Go on with a mission run that another process began at `begun` (on this process's clock)."""
+        self.stage, self.begun = Stage.RUNNING, begun
+        self.executor.subscribe(now)
+        self.executor.adopt(now, state, boots)
+
     def take(self, now: float, node: str, notices: Sequence[Notice]) -> None:
         """Take what a node's caller noticed."""
         self._note_links(node, notices)
@@ -210,3 +217,4 @@ class Mission:
                 self.lost[node] = notice.reason
             elif isinstance(notice, PeerBack):
                 self.lost.pop(node, None)
+                self.executor.store.node(node, notice.boot)

@@ -44,9 +44,9 @@ class RealtimeMission:
             addresses = ", ".join(f"{n} at {self.clients[n].host}:{self.clients[n].port}" for n in missing)
             raise UnreachableError(missing, f"no answer from {addresses}; launch them with `petrobot up`")
 
-    async def run(self) -> None:
-        """Run the mission to its end. Raises MissionError."""
-        self.mission.start(self._loop.time())
+    async def run(self, begin: Callable[[float], None] | None = None) -> None:
+        """Run the mission to its end, from its start or from whatever `begin(now)` makes of it. Raises MissionError."""
+        (begin or self.mission.start)(self._loop.time())
         self.settle()
         await self._over.wait()
         if self._fault is not None:

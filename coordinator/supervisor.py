@@ -64,6 +64,7 @@ class Supervisor:
         logs: Path,
         *,
         respawn: bool = True,
+        wait_ready: bool = True,
         notice: Callable[[str], None] | None = None,
     ) -> None:
         logs.mkdir(parents=True, exist_ok=True)

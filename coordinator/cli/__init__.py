@@ -32,6 +32,9 @@ class Command:
 
 COMMANDS = (
     Command("run", "run a task"),
+    Command("resume", "go on with a run whose coordinator was killed"),
+    Command("log", "print or export a recorded run"),
+    Command("replay", "derive a recorded run again and compare"),
     Command("check", "check a task before it runs"),
     Command("show", "draw a task as SVG"),
     Command("up", "launch the nodes that services.toml places on this host"),

@@ -16,6 +16,7 @@ from coordinator.cli.loading import add_services_argument, load_directory, load_
 if TYPE_CHECKING:
     from coordinator.launch import Setting
     from coordinator.mission import Mission
+    from coordinator.recording import JournalStore
     from coordinator.task import Task
     from coordinator.timeline import Timeline
     from services.comm.directory import Directory
@@ -48,8 +49,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--mock", metavar="FILE", type=Path, help="replace actions by scripted ones")
     parser.add_argument("--json", metavar="FILE", help="write the result as JSON (- for standard output)")
     parser.add_argument("--report", metavar="FOLDER", type=Path, help="leave a report in this folder")
+    parser.add_argument(
+        "--journal",
+        metavar="FOLDER",
+        type=Path,
+        default=Path("runs"),
+        help="where real-time runs are kept (default: %(default)s)",
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress in the terminal")
     add_services_argument(parser)
+    parser.set_defaults(folder=None)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -68,7 +77,7 @@ def run(options: argparse.Namespace) -> int:
     except MissionError as fault:
         raise CommandError(1, str(fault)) from fault
     result = mission.result(options.mode, time.perf_counter() - begun)
-    _give(result, task, timeline, options)
+    give(result, task, timeline, options, options.folder)
     return 0 if result["status"] == "success" else 1
 
 
@@ -177,14 +186,14 @@ async def _spread_lockstep(
     timeline: Timeline,
     watch: Callable[[Mission, float], None] | None,
 ) -> Any:
-    from coordinator.launch import lockstep_member, local_programs
+    from coordinator.launch import local_programs, lockstep_member
     from coordinator.supervisor import Supervisor
 
     if options.mock is not None:
         raise CommandError(2, "--mock in lock step needs --processes 1: scripted actions live in this process")
-    spread, member, party = lockstep_member(directory, setting, watch)
+    member, party = lockstep_member(directory, setting, watch)
     party.mission.executor.observers.append(timeline)
-    programs = local_programs(spread, lockstep=True)
+    programs = local_programs(directory, lockstep=member.address)
     supervisor = Supervisor(programs, Path("runs/logs"), respawn=False, wait_ready=False)
     async with supervisor:
         await asyncio.to_thread(_go, member, lambda: party.over)
@@ -202,30 +211,67 @@ def _go(member: Any, until: Callable[[], bool]) -> None:
 async def _run_realtime(
     directory: Directory, setting: Setting, options: argparse.Namespace
 ) -> tuple[Mission, Timeline]:
-    from coordinator.launch import realtime_mission
-    from coordinator.realtime import RealtimeMission, UnreachableError, key_of
-    from coordinator.supervisor import LaunchError
+    from coordinator.launch import mission_id, realtime_mission
     from coordinator.timeline import Timeline
 
     timeline = Timeline()
-    mission = realtime_mission(directory, setting)
+    identity = mission_id(setting.task)
+    options.folder = options.journal / identity
+    store = _store(directory, setting, options, identity, asyncio.get_running_loop().time())
+    mission = realtime_mission(directory, setting, identity, store)
     mission.executor.observers.append(timeline)
+    await drive(directory, mission, options)
+    return mission, timeline
+
+
+def _store(
+    directory: Directory, setting: Setting, options: argparse.Namespace, mission: str, origin: float
+) -> JournalStore:
+    from coordinator.cli.loading import task_path
+    from coordinator.journal import JournalWriter
+    from coordinator.recording import JournalStore
+    from coordinator.runfolder import JOURNAL, header
+
+    services = directory.source.read_text(encoding="utf-8")
+    given = {
+        "services_path": str(directory.source.resolve()),
+        "seed": setting.seed,
+        "runs": with_runs_of(setting),
+        "parameters": {**setting.task.parameters, **setting.parameters},
+    }
+    first = header(mission, task_path(options.task).read_text(encoding="utf-8"), services, options.mode, given)
+    return JournalStore(JournalWriter(options.journal / mission / JOURNAL, first), origin)
+
+
+def with_runs_of(setting: Setting) -> int:
+    """How many runs a setting asks for."""
+    from coordinator.launch import with_runs
+
+    return with_runs(setting.task, setting.runs)[1]
+
+
+async def drive(
+    directory: Directory, mission: Mission, options: argparse.Namespace, begin: Callable[[float], None] | None = None
+) -> None:
+    """Run a mission in real time over its nodes, launching those of this host first if asked to."""
+    from coordinator.realtime import RealtimeMission, UnreachableError, key_of
+    from coordinator.supervisor import LaunchError
+
     try:
         async with _nodes(directory, options):
             shell = RealtimeMission(mission, directory, key_of(directory))
             try:
                 await shell.connect()
                 with _progress(options) as watch:
-                    await _watched(shell.run(), mission, watch)
+                    await _watched(shell.run(begin), mission, watch)
             finally:
                 await shell.close()
     except (UnreachableError, LaunchError) as fault:
         raise CommandError(3, str(fault)) from fault
-    return mission, timeline
 
 
 def _nodes(directory: Directory, options: argparse.Namespace) -> AbstractAsyncContextManager[Any]:
-    if not options.up:
+    if not getattr(options, "up", False):
         return nullcontext()
     from coordinator.launch import local_programs
     from coordinator.supervisor import Supervisor
@@ -256,7 +302,14 @@ def _progress(options: argparse.Namespace) -> Iterator[Callable[[Mission, float]
         yield watch
 
 
-def _give(result: dict[str, Any], task: Task, timeline: Timeline, options: argparse.Namespace) -> None:
+def give(
+    result: dict[str, Any], task: Task, timeline: Timeline, options: argparse.Namespace, folder: Path | None
+) -> None:
+    """Write the result where it was asked for and beside the journal, print it, leave the report."""
+    if folder is not None:
+        from coordinator.runfolder import RESULT
+
+        write_json(str(folder / RESULT), result)
     if options.json:
         write_json(options.json, result)
     if options.json != "-":

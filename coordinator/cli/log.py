@@ -1,0 +1,74 @@
+"""Print a recorded run for people, or export it: JSON lines, XES for process mining."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+
+from coordinator.cli import CommandError
+from coordinator.cli.replaying import Recorded, recorded
+
+EXAMPLE = "petrobot log last --format xes --out run.xes"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument("run", help="a run's id or folder, or `last`")
+    parser.add_argument("--format", choices=("text", "jsonl", "xes"), default="text", help="default: %(default)s")
+    parser.add_argument("--out", metavar="FILE", default="-", help="where to write it (default: standard output)")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Print or export."""
+    from coordinator.journal import JournalError
+    from coordinator.recording import ReplayError
+
+    found = recorded(options.run)
+    try:
+        _write(options.out, _text(found) if options.format == "text" else _exported(options.format, found))
+    except JournalError as fault:
+        raise CommandError(2, str(fault)) from fault
+    except ReplayError as fault:
+        raise CommandError(1, str(fault)) from fault
+    except OSError as fault:
+        raise CommandError(2, f"{options.out}: {fault.strerror or fault}") from fault
+    return 0
+
+
+def _exported(form: str, found: Recorded) -> Iterator[str]:
+    from coordinator.export import jsonl, xes
+
+    return (jsonl if form == "jsonl" else xes)(found.journal, found.steps())
+
+
+def _write(path: str, lines: Iterator[str]) -> None:
+    if path == "-":
+        for line in lines:
+            print(line)
+        return
+    with Path(path).open("w", encoding="utf-8") as file:
+        file.writelines(line + "\n" for line in lines)
+
+
+def _text(found: Recorded) -> Iterator[str]:
+    from coordinator.engine import Finished, Fired, Report, RunRecorded, StartRun
+
+    header, net = found.journal.header, found.engine.compiled.net
+    yield f"{header['mission']}  {header['date']}  {header['mode']}  seed {header['seed']}"
+    if found.journal.torn_bytes:
+        yield f"(a torn tail of {found.journal.torn_bytes} bytes was dropped)"
+    for step in found.steps():
+        for one in step.instructions:
+            when = f"{step.time:10.3f} s  "
+            if isinstance(one, Fired):
+                yield f"{when}fired    {one.transition:20} {net.describe(one.after)}"
+            elif isinstance(one, StartRun):
+                yield f"{when}started  {one.run:20} {one.action}"
+            elif isinstance(one, RunRecorded):
+                why = f"  {one.cause}: {one.text}" if one.cause else ""
+                yield f"{when}ended    {one.run:20} {one.status.value.upper() if one.status else 'preempted'}{why}"
+            elif isinstance(one, Report):
+                yield f"{when}{one.severity.value:8} {one.of:20} {one.text}"
+            elif isinstance(one, Finished):
+                yield f"{when}finished {one.status.value.upper()}: {one.reason}"

@@ -1,0 +1,47 @@
+"""Derive every marking and instruction of a recorded run again, and fail on the first difference."""
+
+from __future__ import annotations
+
+import argparse
+
+from coordinator.cli import CommandError
+from coordinator.cli.loading import write_json
+from coordinator.cli.replaying import recorded
+
+EXAMPLE = "petrobot replay last"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument("run", help="a run's id or folder, or `last`")
+    parser.add_argument("--json", metavar="FILE", help="write the outcome as JSON (- for standard output)")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Replay; 0 when all is the same, 1 at a difference."""
+    from coordinator.journal import JournalError
+    from coordinator.recording import ReplayError
+
+    found = recorded(options.run)
+    count, firings = 0, 0
+    try:
+        for step in found.steps():
+            count, firings = count + 1, step.state.firings
+    except JournalError as fault:
+        raise CommandError(2, str(fault)) from fault
+    except ReplayError as fault:
+        raise CommandError(1, str(fault)) from fault
+    torn = found.journal.torn_bytes
+    outcome = {
+        "run": found.journal.header["mission"],
+        "stimuli": count,
+        "firings": firings,
+        "torn_bytes": torn,
+        "same": True,
+    }
+    if options.json:
+        write_json(options.json, outcome)
+    if options.json != "-":
+        tail = f"; a torn tail of {torn} bytes was dropped" if torn else ""
+        print(f"{outcome['run']}: {count} stimuli, {firings} firings, all derived again as they were{tail}")
+    return 0

@@ -1,0 +1,56 @@
+"""What `log`, `replay` and `resume` share: a journal found, read, and its engine built anew from the header."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from coordinator.cli import CommandError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from coordinator.engine import Engine
+    from coordinator.journal import Journal
+    from coordinator.recording import Step
+    from coordinator.task import Task
+    from services.comm.directory import Directory
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """A recorded mission run and what it ran with."""
+
+    journal: Journal
+    task: Task
+    directory: Directory
+    engine: Engine
+
+    def steps(self) -> Iterator[Step]:
+        """Every stimulus derived again."""
+        from coordinator.recording import replay
+
+        return replay(self.journal, self.engine)
+
+
+def recorded(name: str) -> Recorded:
+    """Read a run's journal and build its task, directory and engine from the texts in its header."""
+    from coordinator.engine import Engine
+    from coordinator.journal import JournalError, read_journal
+    from coordinator.launch import with_runs
+    from coordinator.runfolder import NoRunError, journal_of
+    from coordinator.taskfile import TaskFileError, loads
+    from services.comm.directory import DirectoryError, parse
+
+    try:
+        journal = read_journal(journal_of(name))
+        header = journal.header
+        task, _ = with_runs(loads(header["task"], f"{journal.path} (task)"), header["runs"])
+        directory = parse(header["services"], Path(header["services_path"]))
+    except (NoRunError, JournalError, TaskFileError, DirectoryError) as fault:
+        raise CommandError(2, str(fault)) from fault
+    except (KeyError, OSError) as fault:
+        raise CommandError(2, f"{name}: {fault}") from fault
+    devices = {a.name: a.device for a in directory.actions.values() if a.device}
+    return Recorded(journal, task, directory, Engine(task, devices))

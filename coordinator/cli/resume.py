@@ -1,0 +1,63 @@
+"""Go on with a run whose coordinator was killed: marking restored, nodes asked for their runs, nothing done twice."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import time
+from typing import TYPE_CHECKING
+
+from coordinator.cli import CommandError
+from coordinator.cli.replaying import Recorded, recorded
+
+if TYPE_CHECKING:
+    from coordinator.mission import Mission
+    from coordinator.timeline import Timeline
+
+EXAMPLE = "petrobot resume last --json out.json"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    from pathlib import Path
+
+    parser.add_argument("run", help="a run's id or folder, or `last`")
+    parser.add_argument("--json", metavar="FILE", help="write the result as JSON (- for standard output)")
+    parser.add_argument("--report", metavar="FOLDER", type=Path, help="leave a report in this folder")
+    parser.add_argument("--quiet", action="store_true", help="no progress in the terminal")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Resume."""
+    from coordinator.cli.run import give
+    from coordinator.journal import JournalError
+    from coordinator.mission import MissionError
+    from coordinator.recording import ReplayError
+
+    found = recorded(options.run)
+    if found.journal.header["mode"] != "realtime":
+        raise CommandError(2, f"{options.run} was run in lock step: run it again with its seed, it gives the same")
+    begun = time.perf_counter()
+    try:
+        mission, timeline = asyncio.run(_resume(found, options))
+    except MissionError as fault:
+        raise CommandError(1, str(fault)) from fault
+    except (JournalError, ReplayError) as fault:
+        raise CommandError(2, str(fault)) from fault
+    result = mission.result("realtime", time.perf_counter() - begun)
+    give(result, found.task, timeline, options, found.journal.path.parent)
+    return 0 if result["status"] == "success" else 1
+
+
+async def _resume(found: Recorded, options: argparse.Namespace) -> tuple[Mission, Timeline]:
+    from coordinator.cli.run import drive
+    from coordinator.engine import Mode
+    from coordinator.launch import resumed_mission
+    from coordinator.timeline import Timeline
+
+    timeline = Timeline()
+    mission, go_on = resumed_mission(found.directory, found.task, found.engine, found.journal, [timeline])
+    if mission.executor.state.mode in (Mode.FRESH, Mode.FINISHED):
+        raise CommandError(2, f"{options.run}: the run {'had ended' if mission.executor.finished else 'had not begun'}")
+    await drive(found.directory, mission, options, go_on)
+    return mission, timeline

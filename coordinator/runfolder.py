@@ -1,0 +1,57 @@
+"""Folders of mission runs: where a journal is kept, how a run is named on the command line, and how long it is kept."""
+
+from __future__ import annotations
+
+import platform
+import shutil
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+JOURNAL = "run.journal"
+RESULT = "result.json"
+DEFAULT = Path("runs")
+
+
+class NoRunError(Exception):
+    """No such mission run; the text says which there are."""
+
+
+def header(mission: str, task: str, services: str, mode: str, rest: Mapping[str, Any]) -> dict[str, Any]:
+    """A journal's header: the texts of task file and services.toml, versions, and whatever else the run was given."""
+    return {
+        "mission": mission,
+        "task": task,
+        "services": services,
+        "mode": mode,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "versions": {"petrobot": version("petrobot"), "python": platform.python_version()},
+        **rest,
+    }
+
+
+def journal_of(name: str, folder: Path = DEFAULT) -> Path:
+    """The journal of a run given by its id, by its folder, by its journal's path, or as `last`. Raises NoRunError."""
+    path = Path(name)
+    candidates = [path, path / JOURNAL, folder / name / JOURNAL]
+    if name == "last":
+        candidates = sorted(folder.glob(f"*/{JOURNAL}"), key=lambda p: p.stat().st_mtime)[-1:]
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate
+    known = sorted(p.parent.name for p in folder.glob(f"*/{JOURNAL}"))
+    there = f"runs in {folder}: {', '.join(known[-8:])}" if known else f"{folder} holds no run"
+    raise NoRunError(f"no run {name!r}; {there}")
+
+
+def retain(folder: Path, keep: int) -> list[str]:
+    """Remove the oldest ended runs beyond the newest `keep`; a run without result is never removed. Gives their names."""
+    ended = sorted(
+        (p for p in folder.glob(f"*/{RESULT}") if (p.parent / JOURNAL).exists()), key=lambda p: p.stat().st_mtime
+    )
+    removed = [path.parent for path in ended[: max(0, len(ended) - keep)]]
+    for path in removed:
+        shutil.rmtree(path)
+    return [path.name for path in removed]
