@@ -10,9 +10,9 @@ from coordinator.check.events import event_faults, external_waits
 from coordinator.check.findings import Finding, Report
 from coordinator.check.flow import never_marked, odd_ends, timeless_cycles, unused
 from coordinator.check.offers import unoffered
-from coordinator.consistency import faults
+from coordinator.conditions.wording import Severity
 from coordinator.task import Task
-from coordinator.wording import Severity
+from coordinator.task.consistency import faults
 
 __all__ = ["Finding", "Report", "Severity", "check"]
 

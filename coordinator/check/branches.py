@@ -7,10 +7,10 @@ from dataclasses import replace
 
 from coordinator.check.findings import Finding
 from coordinator.conditions import Expression
-from coordinator.consistency import condition_domains
-from coordinator.regions import Answer, Domain, covering
+from coordinator.conditions.regions import Answer, Domain, covering
+from coordinator.conditions.wording import Severity
 from coordinator.task import End, Kind, Place, Status, Task, Transition
-from coordinator.wording import Severity
+from coordinator.task.consistency import condition_domains
 
 _EXIT_OF = {Status.SUCCESS: End.NORMAL, Status.FAILURE: End.NORMAL, Status.ERROR: End.ERROR}
 

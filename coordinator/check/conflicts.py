@@ -13,10 +13,10 @@ from itertools import combinations
 
 from coordinator.check.exclusion import never_together, semiflows
 from coordinator.check.findings import Finding
-from coordinator.consistency import condition_domains, is_pulse
-from coordinator.regions import Answer, Domain, exclusive
+from coordinator.conditions.regions import Answer, Domain, exclusive
+from coordinator.conditions.wording import Severity
 from coordinator.task import Early, End, Input, Scope, Task, Transition
-from coordinator.wording import Severity
+from coordinator.task.consistency import condition_domains, is_pulse
 
 MARKING = ("marking", "")
 _LIVE_ENDS = (End.PREEMPT, End.GOING)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from coordinator.check.findings import Finding
+from coordinator.conditions.wording import Severity, listed
 from coordinator.task import End, Event, Kind, Scope, Task, Transition
-from coordinator.wording import Severity, listed
 
 
 def event_faults(task: Task) -> Iterator[Finding]:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from coordinator.wording import Severity
+from coordinator.conditions.wording import Severity
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from coordinator.check.findings import Finding
+from coordinator.conditions.wording import Severity, nearest
 from coordinator.task import Kind, Task
-from coordinator.wording import Severity, nearest
 
 
 def unoffered(task: Task, offers: Mapping[str, str]) -> Iterator[Finding]:

@@ -1,5 +1,6 @@
 """The interpreted net as a pure machine: stimulus in, instructions out. Its semantics stand in docs/semantics.md."""
 
+from coordinator.conditions.wording import Severity
 from coordinator.engine.instructions import (
     ORDERS,
     ArmTimer,
@@ -52,7 +53,6 @@ from coordinator.engine.stimuli import (
     VariableChanged,
     Verdict,
 )
-from coordinator.wording import Severity
 
 __all__ = [
     "OPERATOR",

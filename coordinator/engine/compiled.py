@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from coordinator.conditions import Expression
-from coordinator.consistency import faults, is_pulse
 from coordinator.net import Arcs, Net
 from coordinator.task import Counts, Early, End, Event, Input, Kind, PrimitiveTask, Scope, Task, Transition
+from coordinator.task.consistency import faults, is_pulse
 
 
 @dataclass(frozen=True, slots=True)

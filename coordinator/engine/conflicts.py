@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from coordinator.conditions.wording import Severity
 from coordinator.engine.draft import Draft
 from coordinator.engine.firing import Claims, Match, eligible_runs, match
 from coordinator.task import End
-from coordinator.wording import Severity
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from coordinator.conditions.wording import Severity
 from coordinator.engine.compiled import Compiled
 from coordinator.engine.instructions import Instruction, Report
 from coordinator.engine.state import LIVE, Mode, Phase, Run, State
 from coordinator.net import Marking
 from coordinator.task import Value
-from coordinator.wording import Severity
 
 
 class Draft:

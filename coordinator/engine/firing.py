@@ -7,12 +7,12 @@ from itertools import product
 from typing import NamedTuple
 
 from coordinator.conditions import ConditionFault
+from coordinator.conditions.wording import Severity
 from coordinator.engine.compiled import ActionArc, Exit
 from coordinator.engine.draft import Draft
 from coordinator.engine.instructions import CancelRun, DisarmTimer, Fired
 from coordinator.engine.state import ACTIVE, LIVE, Phase, Run
 from coordinator.task import Counts, End, Status, Value
-from coordinator.wording import Severity
 
 
 class Match(NamedTuple):

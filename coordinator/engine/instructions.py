@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+from coordinator.conditions.wording import Severity as Severity
 from coordinator.net import Marking
 from coordinator.task import Counts, Executed, Status, Value
-from coordinator.wording import Severity
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from coordinator.conditions.wording import Severity
 from coordinator.engine import operator, runs
 from coordinator.engine.compiled import compile_task
 from coordinator.engine.draft import Draft
@@ -48,7 +49,6 @@ from coordinator.engine.stimuli import (
 )
 from coordinator.engine.timers import elapse, hold_timers_of
 from coordinator.task import Counts, Memory, Scope, Task, VariableType
-from coordinator.wording import Severity
 
 _AFTER_THE_END = (RunEnded, StopConfirmed, StopFailed, Verdict)
 _ALWAYS_HEARD = (Abort, Verdict, SetBreakpoints)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from coordinator.conditions.wording import Severity, nearest
 from coordinator.engine.draft import Draft
 from coordinator.engine.firing import Match, arcs_satisfied, fire, forget_flags
 from coordinator.engine.instructions import Marked
@@ -11,7 +12,6 @@ from coordinator.engine.state import LIVE, Mode, Phase, Run
 from coordinator.engine.step import MOVING, Policy, pause, release, resume, settle
 from coordinator.engine.stimuli import AddTokens, ForceExit, RemoveTokens, SetBreakpoints
 from coordinator.task import Counts, End, Kind
-from coordinator.wording import Severity, nearest
 
 
 def add_tokens(draft: Draft, policy: Policy, command: AddTokens) -> None:

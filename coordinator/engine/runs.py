@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from coordinator.conditions.wording import Severity
 from coordinator.engine.draft import Draft
 from coordinator.engine.firing import verdict_variables
 from coordinator.engine.instructions import Choose, Corrected, RunRecorded, StartRun, Subject
 from coordinator.engine.state import ACTIVE, UNSTARTED, Deferred, Phase, Run
 from coordinator.engine.stimuli import RunEnded, StopConfirmed, StopFailed, Verdict
 from coordinator.task import Counts, Executed, Reference, Start, Status, Value
-from coordinator.wording import Severity
 
 
 def admit(draft: Draft) -> bool:

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from coordinator.conditions import ConditionFault
+from coordinator.conditions.wording import Severity
 from coordinator.engine.conflicts import Draw, choose_step
 from coordinator.engine.draft import Draft
 from coordinator.engine.firing import Match, cancel, fire, forget_flags, token_enabled, verdict_variables
@@ -22,7 +23,6 @@ from coordinator.engine.runs import admit
 from coordinator.engine.state import ACTIVE, UNSTARTED, Mode, Phase, Run, Suspended
 from coordinator.engine.timers import disarm_all, hold_timers, refresh_timers, release_timers
 from coordinator.task import Counts, End, Status
-from coordinator.wording import Severity
 
 MOVING = frozenset({Mode.RUNNING, Mode.STEPPING})
 

@@ -6,8 +6,8 @@ import re
 from enum import StrEnum
 from typing import TypeVar
 
+from coordinator.conditions.wording import nearest
 from coordinator.task import Counts, End, Inhibitor, Input, Output
-from coordinator.wording import nearest
 
 W = TypeVar("W", bound=StrEnum)
 _ARC = re.compile(

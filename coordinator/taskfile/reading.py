@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from coordinator.conditions import ConditionError, Expression, parse
-from coordinator.consistency import faults as task_faults
+from coordinator.conditions.wording import Fault
 from coordinator.task import (
     Early,
     Estimate,
@@ -30,10 +30,10 @@ from coordinator.task import (
     Variable,
     VariableType,
 )
+from coordinator.task.consistency import faults as task_faults
 from coordinator.taskfile.arcs import ArcError, read_input, read_output
 from coordinator.taskfile.errors import TaskFileError, key_lines, line_of
 from coordinator.taskfile.table import Table
-from coordinator.wording import Fault
 
 SCHEMA = 1
 LARGEST = 4 << 20

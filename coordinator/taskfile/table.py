@@ -7,7 +7,7 @@ from enum import StrEnum
 from math import isfinite
 from typing import Any, TypeVar
 
-from coordinator.wording import Fault, nearest
+from coordinator.conditions.wording import Fault, nearest
 
 E = TypeVar("E", bound=StrEnum)
 _KINDS: Mapping[type, str] = {

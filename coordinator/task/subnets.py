@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from coordinator.conditions import rename
-from coordinator.task import End, Input, Kind, Output, Place, Subnet, Task, Transition
+from coordinator.task.model import End, Input, Kind, Output, Place, Subnet, Task, Transition
 
 
 def expand(task: Task) -> Task:

@@ -15,7 +15,7 @@ from itertools import pairwise, product
 from math import ceil, floor, prod
 from typing import Any
 
-from coordinator.conditions import (
+from coordinator.conditions.language import (
     And,
     Compare,
     ConditionFault,
@@ -28,7 +28,7 @@ from coordinator.conditions import (
     is_number,
     walk,
 )
-from coordinator.wording import nearest
+from coordinator.conditions.wording import nearest
 
 LIMIT = 50_000
 """Assignments that are tried before the answer is `UNKNOWN`."""

@@ -12,8 +12,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from math import isfinite
 
 from coordinator.conditions import Expression
-from coordinator.regions import Domain, kind_faults
-from coordinator.task import (
+from coordinator.conditions.regions import Domain, kind_faults
+from coordinator.conditions.wording import Fault, listed, nearest
+from coordinator.task.model import (
     Early,
     End,
     Event,
@@ -32,7 +33,6 @@ from coordinator.task import (
     Variable,
     VariableType,
 )
-from coordinator.wording import Fault, listed, nearest
 
 _IDENTIFIER = re.compile(r"[^\W\d]\w*\Z")
 _RESERVED = frozenset({"and", "or", "not", "true", "false", "none"})

@@ -328,7 +328,7 @@ class Task:
     @cached_property
     def flat(self) -> Task:
         """The task with every macro place replaced by its subnet; itself if there is none."""
-        from coordinator.subnets import expand
+        from coordinator.task.subnets import expand
 
         return expand(self) if any(p.kind is Kind.MACRO for p in self.places.values()) else self
 

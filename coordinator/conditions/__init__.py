@@ -1,0 +1,43 @@
+"""Conditions of tasks: the expression language, what can be proved about sets of conditions, and how faults are worded."""
+
+from coordinator.conditions.language import (
+    And,
+    Compare,
+    ConditionError,
+    ConditionFault,
+    Expression,
+    Literal,
+    Name,
+    Node,
+    Not,
+    Or,
+    parse,
+    rename,
+    walk,
+)
+from coordinator.conditions.regions import Answer, Domain, Verdict, covering, exclusive, kind_faults
+from coordinator.conditions.wording import Fault, Severity
+
+__all__ = [
+    "And",
+    "Answer",
+    "Compare",
+    "ConditionError",
+    "ConditionFault",
+    "Domain",
+    "Expression",
+    "Fault",
+    "Literal",
+    "Name",
+    "Node",
+    "Not",
+    "Or",
+    "Severity",
+    "Verdict",
+    "covering",
+    "exclusive",
+    "kind_faults",
+    "parse",
+    "rename",
+    "walk",
+]
