@@ -137,7 +137,7 @@ def realtime_mission(directory: Directory, setting: Setting, mission: str, store
 
 
 def resumed_mission(
-    directory: Directory, task: Task, engine: Engine, journal: Journal, observers: Sequence[Observer]
+    directory: Directory, task: Task, engine: Engine, journal: Journal, observers: Sequence[Observer], now: float
 ) -> tuple[Mission, Callable[[float], None]]:
     """A mission run as its journal left it, and what makes it go on once the nodes are there.
 
@@ -149,7 +149,7 @@ def resumed_mission(
     writer.append(EPOCH, {"epoch": epoch})
     writer.sync()
     steps = list(replay(journal, engine))
-    origin = time.monotonic() - (steps[-1].time if steps else 0.0)
+    origin = now - (steps[-1].time if steps else 0.0)
     callers = make_callers(directory, secrets.token_hex(8), epoch)
     executor = Executor(
         task, engine, directory, callers, header["mission"], header["seed"], store=JournalStore(writer, origin)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 
 from coordinator.mission import Mission, MissionError, Stage
 from services.comm.client import Client
 from services.comm.directory import Directory
 from services.comm.notice import Notice
+from services.comm.security import read_key
 
 
 class UnreachableError(Exception):
@@ -87,6 +87,5 @@ class RealtimeMission:
 
 
 def key_of(directory: Directory) -> bytes | None:
-    """The shared key that services.toml names, None without one."""
-    path = directory.keys.get("file")
-    return Path(directory.file(path)).read_bytes().strip() if path else None
+    """The shared key that services.toml names, None without one. Raises what `read_key` does."""
+    return read_key(directory.file(directory.keys["file"])) if "file" in directory.keys else None

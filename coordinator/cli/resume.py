@@ -56,7 +56,8 @@ async def _resume(found: Recorded, options: argparse.Namespace) -> tuple[Mission
     from coordinator.timeline import Timeline
 
     timeline = Timeline()
-    mission, go_on = resumed_mission(found.directory, found.task, found.engine, found.journal, [timeline])
+    now = asyncio.get_running_loop().time()
+    mission, go_on = resumed_mission(found.directory, found.task, found.engine, found.journal, [timeline], now)
     if mission.executor.state.mode in (Mode.FRESH, Mode.FINISHED):
         raise CommandError(2, f"{options.run}: the run {'had ended' if mission.executor.finished else 'had not begun'}")
     await drive(found.directory, mission, options, go_on)

@@ -89,6 +89,12 @@ class Half:
         self._sequences: dict[str, int] = {}
         self._owners: dict[str, str] = {}
 
+    def replace(self, party: Party) -> None:
+        """Another party takes a name over. Raises CellError if there is none of its name."""
+        if party.name not in self._parties:
+            raise CellError(f"no party is named {party.name}; there are {sorted(self._parties)}")
+        self._parties[party.name] = party
+
     def step(self, tick: int) -> list[Posted]:
         """Run one tick. Gives the envelopes for parties that do not live here, in the order they were sent."""
         now = tick * TICK
@@ -156,6 +162,10 @@ class Cell:
         """Run one tick."""
         self._half.step(self.tick)
         self.tick += 1
+
+    def replace(self, party: Party) -> None:
+        """Another party takes a name over, as a process that was started again does; what is on its way still arrives."""
+        self._half.replace(party)
 
     def run(self, until: Callable[[], bool], max_ticks: int) -> bool:
         """Run ticks until `until()` holds after one, at most `max_ticks`. Says whether it held."""

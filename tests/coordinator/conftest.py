@@ -1,0 +1,14 @@
+"""What the tests of the coordinator share: the shipped task."""
+
+from __future__ import annotations
+
+import pytest
+
+from coordinator.cli.loading import load_task
+from coordinator.task import Task
+
+
+@pytest.fixture
+def catch_ball() -> Task:
+    """The shipped task."""
+    return load_task("catch_ball")

@@ -1,0 +1,38 @@
+"""A cell of scripted actions for tests of the coordinator: one node, no devices, every action of a task on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from coordinator.task import Task
+from services.comm.directory import Directory, parse
+from services.scripted import Line, Scripted
+
+HEAD = """
+schema = 1
+[nodes.node]
+host = "127.0.0.1"
+port = 7999
+[timers.image_tick]
+node = "node"
+period = 0.04
+[services.memory]
+node = "node"
+"""
+
+
+def directory_for(task: Task, extra: str = "") -> Directory:
+    """A services.toml that places the first alternative of each primitive task on one node."""
+    actions = "".join(
+        f'[actions.{p.alternatives[0]}]\nrun = "scripted:nothing"\ntask = "{p.name}"\nnode = "node"\n'
+        for p in task.primitive_tasks.values()
+    )
+    return parse(HEAD + actions + extra, Path("services.toml"))
+
+
+def scripts(task: Task, lines: Mapping[str, list[Line]]) -> dict[str, Callable[..., Any]]:
+    """A scripted action for the first alternative of each primitive task; half a second of success if none is given."""
+    usual = [Line(seconds=(0.5, 0.5))]
+    return {p.alternatives[0]: Scripted(lines.get(p.name, usual)) for p in task.primitive_tasks.values()}

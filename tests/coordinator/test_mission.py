@@ -1,0 +1,113 @@
+"""A mission run over scripted actions in lock step: results, cycles, errors, repetition."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from coordinator.executor import FirstAlternative
+from coordinator.launch import Setting, lockstep_cell
+from coordinator.mission import Mission
+from coordinator.task import Status, Task
+from coordinator.timeline import Timeline
+from services.action import Status as ActionStatus
+from services.scripted import Line
+from tests.coordinator.scripted_cell import directory_for, scripts
+
+
+def run(task: Task, lines: dict[str, list[Line]], **given: Any) -> tuple[Mission, Timeline]:
+    """Run to the end, at most an hour of simulated time."""
+    timeline = Timeline()
+    cell, party = lockstep_cell(directory_for(task), Setting(task, **given), scripts(task, lines))
+    party.mission.executor.observers.append(timeline)
+    assert cell.run(lambda: party.over, 900_000)
+    return party.mission, timeline
+
+
+def failing(cause: str, status: ActionStatus = ActionStatus.ERROR) -> Line:
+    """A run that ends after 0.1 s with this cause."""
+    return Line(status, (0.1, 0.1), cause=cause)
+
+
+GOOD = Line(seconds=(0.2, 0.2))
+
+
+def test_four_runs_reach_final(catch_ball: Task) -> None:
+    """The initial marking of figure 1 means four runs."""
+    mission, timeline = run(catch_ball, {})
+    result = mission.result("lockstep", 1.0)
+    assert (result["status"], result["runs"], len(mission.tally.cycles)) == ("success", 4, 4)
+    assert result["firings"] == len(timeline.firings) > 4 * 5
+    assert result["sim_s"] > 4 * 2.0
+    assert [c.number for c in mission.tally.cycles] == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("runs", [1, 7])
+def test_number_of_runs_is_the_users(catch_ball: Task, runs: int) -> None:
+    """--runs puts tokens into the runs place."""
+    mission, _ = run(catch_ball, {}, runs=runs)
+    assert len(mission.tally.cycles) == mission.runs == runs
+
+
+@pytest.mark.parametrize(
+    ("primitive", "cause"),
+    [
+        ("locate_ball", "no_ball"),
+        ("track_ball", "ball_lost"),
+        ("move_to_point", "unreachable"),
+        ("catch_ball", "drive_fault"),
+        ("return_home", "drive_fault"),
+    ],
+)
+def test_every_error_branch_comes_back(catch_ball: Task, primitive: str, cause: str) -> None:
+    """An error in the first run uses that run up; the others go on."""
+    good = [GOOD] * 3
+    mission, timeline = run(catch_ball, {primitive: [failing(cause), *good]})
+    assert mission.executor.finished is not None
+    assert mission.executor.finished.status is Status.SUCCESS
+    assert [c.status for c in mission.tally.cycles] == [Status.ERROR, *[Status.SUCCESS] * 3]
+    assert mission.tally.cycles[0].cause == cause
+    assert [bar.cause for bar in timeline.bars.values() if bar.status is Status.ERROR] == [cause]
+
+
+def test_an_arm_that_cannot_be_recovered_ends_the_task_in_error(catch_ball: Task) -> None:
+    """Four failed recoveries in a row: given up honestly, with runs left."""
+    mission, _ = run(catch_ball, {"move_to_point": [failing("drive_fault")], "recover_arm": [failing("drive_fault")]})
+    finished = mission.executor.finished
+    assert finished is not None
+    assert finished.status is Status.ERROR
+    assert len(mission.tally.cycles) == 1
+    assert sum(r.place == "recover_arm" for r in mission.tally.runs) == 4
+
+
+def test_failure_goes_on_along_the_normal_branch(catch_ball: Task) -> None:
+    """A ball that passes is a failure: the run was used up, nothing is recovered."""
+    mission, timeline = run(catch_ball, {"catch_ball": [failing("missed", ActionStatus.FAILURE)]})
+    assert [c.status for c in mission.tally.cycles] == [Status.FAILURE] * 4
+    assert not any(bar.place == "recover_arm" for bar in timeline.bars.values())
+
+
+def test_a_raised_deadline_is_an_error_with_a_reason(catch_ball: Task) -> None:
+    """A run that never ends is ended by its node at its deadline."""
+    mission, _ = run(catch_ball, {"locate_ball": [Line(seconds=(1e6, 1e6)), GOOD, GOOD, GOOD]})
+    first = mission.tally.runs[0]
+    assert (first.status, first.cause) == (Status.ERROR, "deadline")
+    assert 8.0 <= first.seconds < 8.2
+
+
+def test_the_same_seed_gives_the_same_run(catch_ball: Task) -> None:
+    """Durations drawn by scripts are keyed by seed and run."""
+    lines = {"track_ball": [Line(seconds=(0.1, 2.0))]}
+    one, again, other = (run(catch_ball, lines, seed=seed)[1] for seed in (5, 5, 6))
+    assert one.firings == again.firings
+    assert one.firings != other.firings
+
+
+def test_the_user_chooses_the_action(catch_ball: Task) -> None:
+    """A selector's choice is what runs, with its reason."""
+    chosen = FirstAlternative({"track_ball": "predict_kalman"})
+    mission, _ = run(catch_ball, {}, selector=chosen, runs=1)
+    track = next(r for r in mission.tally.runs if r.place == "track_ball")
+    assert track.action == "predict_kalman"
+    assert (track.status, track.cause) == (Status.ERROR, "not_offered")

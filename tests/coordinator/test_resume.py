@@ -1,0 +1,166 @@
+"""A coordinator that dies at any record of its journal: the resumed run ends as the undisturbed one, nothing runs twice."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from coordinator.engine import Engine, Instruction, State, Stimulus
+from coordinator.journal import JournalWriter, read_journal
+from coordinator.launch import Setting, lockstep_party, make_mission, resumed_mission, with_runs
+from coordinator.lockstep_party import CoordinatorParty
+from coordinator.mission import Mission
+from coordinator.recording import JournalStore, ReplayError, replay
+from coordinator.task import Status, Task
+from services.action import Status as ActionStatus
+from services.comm.cell import Cell
+from services.scripted import Line
+from tests.coordinator.scripted_cell import directory_for, scripts
+
+LINES = {
+    "locate_ball": [Line(seconds=(0.2, 0.2), values={"ball": [1.0, 0.1]})],
+    "move_to_point": [
+        Line(seconds=(0.3, 0.3)),
+        Line(ActionStatus.ERROR, (0.1, 0.1), cause="unreachable", text="y = 0.9 m"),
+        Line(seconds=(0.3, 0.3)),
+        Line(seconds=(0.3, 0.3)),
+    ],
+    "catch_ball": [Line(ActionStatus.FAILURE, (0.2, 0.2), cause="missed"), Line(seconds=(0.2, 0.2))],
+}
+
+
+RUNS = 4
+
+
+class CrashError(Exception):
+    """The coordinator is gone."""
+
+
+class MortalStore(JournalStore):
+    """Dies after so many operations (appends and syncs), as kill -9 would: what was not synced is lost with the process."""
+
+    def __init__(self, writer: JournalWriter, lives: int) -> None:
+        super().__init__(writer, 0.0)
+        self._lives = lives
+        self.operations = 0
+
+    def _count(self) -> None:
+        self.operations += 1
+        if self.operations == self._lives:
+            raise CrashError
+
+    def append(self, now: float, stimulus: Stimulus, instructions: Sequence[Instruction], state: State) -> None:
+        self._count()
+        super().append(now, stimulus, instructions, state)
+
+    def sync(self) -> None:
+        self._count()
+        super().sync()
+        self._count()
+
+
+class Laboratory:
+    """A scripted cell whose nodes outlive their coordinator, and count how often each run was executed."""
+
+    def __init__(self, task: Task, folder: Path) -> None:
+        self.task, self.folder = task, folder
+        self.directory = directory_for(task)
+        self.executed: Counter[str] = Counter()
+        counted = {name: self._counting(action) for name, action in scripts(task, LINES).items()}
+        self.node = lockstep_party(self.directory, self.directory.nodes["node"], counted)
+        self.cell: Cell | None = None
+
+    def _counting(self, action: Callable[..., Any]) -> Callable[..., Any]:
+        def counting(ctx: Any, **arguments: Any) -> Any:
+            self.executed[ctx.run] += 1
+            return action(ctx, **arguments)
+
+        return counting
+
+    def begin(self, lives: int) -> tuple[Mission, MortalStore]:
+        """Run until the end or the crash."""
+        header = {"mission": "m", "seed": 1, "runs": RUNS, "parameters": dict(self.task.parameters)}
+        store = MortalStore(JournalWriter(self.folder / "run.journal", header), lives)
+        mission = make_mission(self.directory, Setting(self.task, runs=RUNS), "m", "boot-1", store)
+        self.go(mission)
+        return mission, store
+
+    def resume(self) -> Mission:
+        """A new process takes the journal and goes on with the same nodes."""
+        task, runs = with_runs(self.task, RUNS)
+        assert runs == RUNS
+        assert self.cell is not None
+        journal = read_journal(self.folder / "run.journal")
+        mission, go_on = resumed_mission(self.directory, task, Engine(task), journal, [], self.cell.now)
+        mission.start = go_on  # type: ignore[method-assign]
+        self.go(mission)
+        return mission
+
+    def go(self, mission: Mission) -> None:
+        """Run the cell with this coordinator until it is over; raises CrashError when it dies."""
+        party = CoordinatorParty(self.directory, mission)
+        if self.cell is None:
+            self.cell = Cell([party, self.node])
+        else:
+            self.cell.replace(party)
+        assert self.cell.run(lambda: party.over, 100_000)
+
+
+def outcome(mission: Mission) -> Mapping[str, Any]:
+    """What must not depend on a crash."""
+    finished = mission.executor.finished
+    assert finished is not None
+    return {
+        "status": finished.status,
+        "marking": mission.executor.state.marking,
+        "runs": sorted((r.run, r.status, r.cause) for r in mission.tally.runs),
+        "cycles": [(c.number, c.status, c.cause) for c in mission.tally.cycles],
+        "firings": mission.tally.firings,
+    }
+
+
+def undisturbed(task: Task, folder: Path) -> tuple[Mapping[str, Any], int]:
+    """The outcome without a crash, and how many places there are to crash at."""
+    laboratory = Laboratory(task, folder / "undisturbed")
+    mission, store = laboratory.begin(0)
+    assert set(laboratory.executed.values()) == {1}
+    return outcome(mission), store.operations
+
+
+def test_dying_anywhere_changes_nothing(catch_ball: Task, tmp_path: Path) -> None:
+    """Crash at every operation of the journal in turn, resume, and compare with the undisturbed run."""
+    expected, operations = undisturbed(catch_ball, tmp_path)
+    assert expected["status"] is Status.SUCCESS
+    assert operations > 60
+    crashed = 0
+    for lives in range(2, operations):
+        laboratory = Laboratory(catch_ball, tmp_path / str(lives))
+        try:
+            laboratory.begin(lives)
+        except CrashError:
+            crashed += 1
+        else:
+            pytest.fail(f"no crash at operation {lives}")
+        records = read_journal(laboratory.folder / "run.journal").records
+        if not any(r.kind == "stimulus" for r in records):
+            continue
+        assert outcome(laboratory.resume()) == expected, f"crash at operation {lives}"
+        assert set(laboratory.executed.values()) == {1}, f"crash at operation {lives}: {laboratory.executed}"
+    assert crashed == operations - 2
+
+
+def test_replay_derives_everything_again(catch_ball: Task, tmp_path: Path) -> None:
+    """The journal alone gives every marking; a changed task is noticed at the first difference."""
+    laboratory = Laboratory(catch_ball, tmp_path)
+    mission, _ = laboratory.begin(0)
+    task, _ = with_runs(catch_ball, RUNS)
+    journal = read_journal(tmp_path / "run.journal")
+    steps = list(replay(journal, Engine(task)))
+    assert steps[-1].state == mission.executor.state
+    other, _ = with_runs(catch_ball, RUNS - 1)
+    with pytest.raises(ReplayError, match=r"record \d+ \(Begin\)"):
+        list(replay(journal, Engine(other)))
