@@ -186,10 +186,17 @@ class CanopenNode:
 
     # What a device adds.
     def before_sending(self) -> None:
-        """Bring the objects that a TPDO or an SDO read shows up to date."""
+        """Bring the objects that a TPDO may carry up to date."""
+
+    def before_reading(self) -> None:
+        """Bring all objects that change by themselves up to date."""
+        self.before_sending()
+
+    def after_configuring(self) -> None:
+        """Take over what an SDO write has changed."""
 
     def after_receiving(self, now: float) -> None:
-        """Act on objects that an RPDO or an SDO write changed."""
+        """Act on the objects that an RPDO, or an SDO write, has just brought."""
 
     def on_sync(self, now: float) -> None:
         """Act on SYNC, after a synchronous RPDO was applied and before the TPDO is built."""
@@ -210,6 +217,7 @@ class CanopenNode:
         self.dictionary.reset()
         self.rpdo.refresh()
         self.tpdo.refresh()
+        self.after_configuring()
         self._latched, self._master_due, self._beat_due = None, None, now
         self.outbox.append(heartbeat(self.node, NmtState.BOOT_UP))
         self.nmt = NmtState.PREOPERATIONAL
@@ -311,7 +319,6 @@ class CanopenNode:
         index, sub, data = request.index, request.sub, request.data
         if request.command == 0x40:
             self.dictionary.entry(index, sub)
-            self.before_sending()
             return sdo_read_reply(self.node, index, sub, self.dictionary.read(index, sub))
         if request.command != 0x20:
             raise SdoAbortError(Abort.COMMAND, index, sub)
@@ -331,6 +338,7 @@ class CanopenNode:
             pdo.refresh()
         if (index, sub) == (0x1016, 1):
             self._master_due = None  # watched from the next heartbeat on
+        self.after_configuring()
         self.after_receiving(now)
 
     @staticmethod

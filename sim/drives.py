@@ -9,6 +9,7 @@ from typing import Any, Final, Protocol
 from services.comm.canbus import Frame
 from services.comm.canopen import Abort, NmtState, SdoAbortError
 from services.comm.cia402 import (
+    UNITS,
     Command,
     Fault,
     Mode,
@@ -37,6 +38,13 @@ _REGISTERS: Final = {
 }  # fmt: skip
 _POWERLESS: Final = (Fault.OVERCURRENT, Fault.UNDERVOLTAGE, Fault.ENCODER)
 """Faults after which a drive cannot brake by its motor: the brake takes over at once."""
+_STATUSWORD, _CONTROLWORD = (Object.STATUSWORD, 0), (Object.CONTROLWORD, 0)
+_POSITION, _VELOCITY, _TORQUE, _TARGET = (
+    (Object.POSITION, 0),
+    (Object.VELOCITY, 0),
+    (Object.TORQUE, 0),
+    (Object.TARGET_POSITION, 0),
+)
 _POWERED: Final = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
 _DOWN: Final = (State.FAULT, State.FAULT_REACTION_ACTIVE)
 
@@ -89,6 +97,7 @@ class Drive(CanopenNode):
         self._controlword = 0
         self._synced = 0.0
         self._error_since: float | None = None
+        self.after_configuring()
 
     # Hooks of the CANopen node.
     def on_nmt(self, now: float, before: NmtState) -> None:
@@ -102,19 +111,23 @@ class Drive(CanopenNode):
         self._refresh()
 
     def before_sending(self) -> None:
-        """Bring status, position and what else is asked for up to date."""
-        values, servo = self.values, self.servo
-        values[Object.STATUSWORD, 0] = self.statusword()
-        values[Object.POSITION, 0] = to_units(self.plant.q[self.joint])
-        values[Object.VELOCITY, 0] = to_units(self.plant.qd[self.joint])
-        values[Object.TORQUE, 0] = round(1000.0 * self._torque / servo.rating.torque)
-        values[Object.FOLLOWING_ERROR, 0] = to_units(servo.error)
-        values[Object.ERROR_CODE, 0] = self.fault
-        values[Object.MODE_DISPLAY, 0] = values[Object.MODE, 0]
+        """Bring status, position, speed and torque up to date."""
+        values = self.values
+        values[_STATUSWORD] = self.statusword()
+        values[_POSITION] = round(self.plant.q[self.joint] * UNITS)
+        values[_VELOCITY] = round(self.plant.qd[self.joint] * UNITS)
+        values[_TORQUE] = round(1000.0 * self._torque / self.servo.rating.torque)
+
+    def before_reading(self) -> None:
+        """Bring what only an SDO reads up to date as well."""
+        self.before_sending()
+        self.values[Object.FOLLOWING_ERROR, 0] = to_units(self.servo.error)
+        self.values[Object.ERROR_CODE, 0] = self.fault
+        self.values[Object.MODE_DISPLAY, 0] = self.values[Object.MODE, 0]
 
     def after_receiving(self, now: float) -> None:
         """Obey the controlword; take over what configuration changes."""
-        word = self.values[Object.CONTROLWORD, 0]
+        word = self.values[_CONTROLWORD]
         before, self._controlword = self._controlword, word
         command = command_of(word)
         if command is Command.FAULT_RESET and before & 0x80:
@@ -126,11 +139,21 @@ class Drive(CanopenNode):
         """A new set point is due."""
         self._synced = now
         if self.state is State.OPERATION_ENABLED:
-            self.servo.aim(from_units(self._target()))
+            self.servo.aim(self._target())
 
     def on_master_lost(self, now: float) -> None:
         """Stop by itself."""
         self.trip(Fault.HEARTBEAT)
+
+    def after_configuring(self) -> None:
+        """Take over how the drive watches itself."""
+        values = self.values
+        self._window = values[Object.FOLLOWING_ERROR_WINDOW, 0] / UNITS
+        self._patience = values[Object.FOLLOWING_ERROR_TIMEOUT, 0] * 1e-3
+        self._sync_patience = SYNC_PATIENCE * values[Object.SYNC_PERIOD, 0] * 1e-6 or math.inf
+        self._range = values[Object.SOFTWARE_LIMITS, 1], values[Object.SOFTWARE_LIMITS, 2]
+        if values[Object.INTERPOLATION_PERIOD, 1]:
+            self.servo.period = values[Object.INTERPOLATION_PERIOD, 1] * 10.0 ** values[Object.INTERPOLATION_PERIOD, 2]
 
     def check_write(self, index: int, sub: int, value: int) -> None:
         """No other mode than cyclic synchronous position, and no change of configuration while the motor has torque."""
@@ -159,7 +182,7 @@ class Drive(CanopenNode):
 
     def statusword(self) -> int:
         """Object 6041h."""
-        word: int = self.state.value[1] | StatusBit.REMOTE
+        word: int = self.state.word | StatusBit.REMOTE
         if self.powered:
             word |= StatusBit.VOLTAGE_ENABLED
         if self.state is State.OPERATION_ENABLED:
@@ -183,21 +206,19 @@ class Drive(CanopenNode):
 
     def _watch(self, now: float) -> None:
         """Following error (6065h, 6066h) and loss of SYNC (1006h)."""
-        period = self.values[Object.SYNC_PERIOD, 0] * 1e-6
-        if period and now - self._synced > SYNC_PATIENCE * period + 1e-9:
+        if now - self._synced > self._sync_patience + 1e-9:
             self.trip(Fault.SYNC_LOST)
-            return
-        if abs(self.servo.error) <= self.values[Object.FOLLOWING_ERROR_WINDOW, 0] * 1e-6:
+        elif abs(self.servo.error) <= self._window:
             self._error_since = None
         elif self._error_since is None:
             self._error_since = now
-        elif now - self._error_since >= self.values[Object.FOLLOWING_ERROR_TIMEOUT, 0] * 1e-3:
+        elif now - self._error_since >= self._patience:
             self.trip(Fault.FOLLOWING_ERROR)
 
-    def _target(self) -> int:
-        """Object 607Ah within the software limits 607Dh."""
-        low, high = self.values[Object.SOFTWARE_LIMITS, 1], self.values[Object.SOFTWARE_LIMITS, 2]
-        return min(max(self.values[Object.TARGET_POSITION, 0], low), high)
+    def _target(self) -> float:
+        """Object 607Ah within the software limits 607Dh, in rad."""
+        low, high = self._range
+        return min(max(self.values[_TARGET], low), high) / UNITS
 
     def _obey(self, now: float, command: Command) -> None:
         state = after(self.state, command)
@@ -219,7 +240,7 @@ class Drive(CanopenNode):
 
     def _enable(self, now: float) -> None:
         if self.state is State.QUICK_STOP_ACTIVE:
-            self.servo.follow(from_units(self._target()))
+            self.servo.follow(self._target())
         else:
             self.servo.start(self.plant.q[self.joint])
         self._synced = now

@@ -6,7 +6,7 @@ speeds in micro-radians per second, so an INTEGER32 holds 2,147 rad.
 
 from __future__ import annotations
 
-from enum import Enum, IntEnum, IntFlag
+from enum import Enum, IntEnum
 from typing import Final
 
 from services.comm.canopen import Mapped, Type
@@ -28,6 +28,10 @@ def from_units(units: int) -> float:
 class State(Enum):
     """The power drive system's states; the value is (mask, pattern) of the statusword's low byte (CiA 402-2, table 31)."""
 
+    def __init__(self, mask: int, word: int) -> None:
+        self.word = word
+        """The bits of the statusword that show this state."""
+
     NOT_READY_TO_SWITCH_ON = (0x4F, 0x00)
     SWITCH_ON_DISABLED = (0x4F, 0x40)
     READY_TO_SWITCH_ON = (0x6F, 0x21)
@@ -38,7 +42,7 @@ class State(Enum):
     FAULT = (0x4F, 0x08)
 
 
-class StatusBit(IntFlag):
+class StatusBit(IntEnum):
     """Statusword bits outside the state pattern; 12 and 13 as in cyclic synchronous position mode."""
 
     VOLTAGE_ENABLED = 1 << 4
@@ -60,10 +64,9 @@ class Command(Enum):
     QUICK_STOP = (0x86, 0x02)
     FAULT_RESET = (0x80, 0x80)
 
-    @property
-    def word(self) -> int:
+    def __init__(self, mask: int, word: int) -> None:
+        self.word = word
         """A controlword that gives this command."""
-        return self.value[1]
 
 
 class Mode(IntEnum):
@@ -161,25 +164,37 @@ SENT: Final = (
 """Objects of the TPDO that each drive sends on SYNC."""
 
 
-def state_of(statusword: int) -> State:
-    """The state that a statusword shows; raises ValueError for a pattern that is none."""
+def _state(statusword: int) -> State | None:
     for state in State:
         mask, pattern = state.value
         if statusword & mask == pattern:
             return state
-    raise ValueError(f"statusword {statusword:#06x} shows no state of CiA 402")
+    return None
 
 
-def command_of(controlword: int) -> Command | None:
-    """The command that a controlword gives (FAULT_RESET only by its bit; the edge is for the drive to see)."""
-    for command in (
-        Command.FAULT_RESET, Command.DISABLE_VOLTAGE, Command.QUICK_STOP,
-        Command.ENABLE_OPERATION, Command.SWITCH_ON, Command.SHUTDOWN,
-    ):  # fmt: skip
+def _command(controlword: int) -> Command | None:
+    for command in reversed(Command):
         mask, pattern = command.value
         if controlword & mask == pattern:
             return command
     return None
+
+
+_STATES: Final = tuple(_state(low) for low in range(256))
+_COMMANDS: Final = tuple(_command(low) for low in range(256))
+
+
+def state_of(statusword: int) -> State:
+    """The state that a statusword shows; raises ValueError for a pattern that is none."""
+    state = _STATES[statusword & 0xFF]
+    if state is None:
+        raise ValueError(f"statusword {statusword:#06x} shows no state of CiA 402")
+    return state
+
+
+def command_of(controlword: int) -> Command | None:
+    """The command that a controlword gives (FAULT_RESET only by its bit; the edge is for the drive to see)."""
+    return _COMMANDS[controlword & 0xFF]
 
 
 TRANSITIONS: Final = {

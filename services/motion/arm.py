@@ -40,9 +40,13 @@ LEASE: Final = 0.5
 SPEED_SHARE: Final = 0.97
 """Share of the drives' greatest speed that is commanded: the rest is theirs to catch up with."""
 IN_PLACE: Final = 0.003
-"""rad by which the measured joints may differ from the target that they are said to have reached."""
-LAG_CYCLES: Final = 3
-"""Cycles by which the measured joints follow the commanded ones: bus, interpolation, sampling."""
+"""rad by which the measured joints may differ from the pose that a move is said to have reached."""
+NEAR_PLACE: Final = 0.02
+"""rad, the same while following, where small corrections never end: 5 mm at the cup."""
+LAG_CYCLES: Final = 8
+"""Cycles by which the measured joints may follow the commanded ones: bus, links, interpolation, sampling."""
+LOST: Final = 0.15
+"""rad of following error at which the servo itself gives up, besides the drives' own watch."""
 BALL: Final = 0x01
 POWER: Final = 0x02
 
@@ -276,6 +280,9 @@ class Arm:
         if not enabled:
             self._off("fault" if self._master.troubles else "disabled")
             return
+        if not (self._trajectory.still and self._standing()) and self._lag() > LOST:
+            self._master.give_up(f"the joints are more than {LOST} rad off the commanded path")
+            return
         if self._mode == "follow":
             self._follow_on(now)
         self._advance()
@@ -324,16 +331,22 @@ class Arm:
         self._mode, self._reason, self._after_stop = "off", reason, ""
 
     def _lag(self) -> float:
-        """Greatest difference of a measured joint from what was commanded when it was due (rad)."""
-        if self._mode == "off" or len(self._commanded) <= LAG_CYCLES:
+        """How far (rad) the measured joints are off the path commanded of late; how late they are on it does not count."""
+        if self._mode == "off" or not self._commanded:
             return 0.0
-        return max(abs(a - b) for a, b in zip(self._commanded[0], self._measured, strict=True))
+        q = self._measured
+        return min(max(abs(a - b) for a, b in zip(then, q, strict=True)) for then in self._commanded)
 
     def _in_place(self) -> bool:
         target = self._trajectory.target
-        if self._mode == "off" or target is None or not self._trajectory.arrived():
+        if self._mode == "off" or target is None:
             return False
-        return max(abs(a - b) for a, b in zip(target, self._measured, strict=True)) < IN_PLACE
+        follows = self._mode == "follow"
+        if not follows and not self._trajectory.arrived():
+            return False
+        return max(abs(a - b) for a, b in zip(target, self._measured, strict=True)) < (
+            NEAR_PLACE if follows else IN_PLACE
+        )
 
     def _standing(self) -> bool:
         return max(map(abs, self._measured_speed)) < _STANDING

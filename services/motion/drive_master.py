@@ -201,6 +201,10 @@ class DriveMaster:
             drive.error_code = 0
         self.phase, self._begin_at = Phase.CONFIGURING, now
 
+    def give_up(self, why: str) -> None:
+        """The servo itself finds that the drives do not follow: stop them."""
+        self._report(Trouble("drive_fault", None, Fault.FOLLOWING_ERROR, why))
+
     def bus_lost(self, now: float, why: str) -> None:
         """The bus itself is gone: nothing is enabled any more; configure again when it is back."""
         self._report(Trouble("bus", None, 0, why))

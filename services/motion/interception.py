@@ -75,6 +75,14 @@ STRATEGIES: Final = {
 
 PRIOR_SPREAD: Final = 0.17
 """m, standard deviation of where balls leave: uniform within +-0.30 m."""
+DEPTH_COST: Final = 2.0
+"""s per m off the preferred depth."""
+CLOSED_COST: Final = 4.0
+"""s per unit of cosine by which the mouth is less open to the ball than it should be."""
+LATE_COST: Final = 20.0
+"""Weight of each second too late."""
+EARLY: Final = 0.05
+"""s of slack below which time costs more."""
 KEEP: Final = 0.03
 """Cost by which another candidate must be better than the present one."""
 
@@ -102,6 +110,7 @@ class Interceptor:
         self._branch = branch
         self._home = np.asarray(home, dtype=float)
         self._mouth = np.asarray(cell.cup.mouth)
+        self._layouts: dict[Strategy, _Layout] = {}
         axis = np.asarray(cell.cup.axis)
         outward = np.array([0.0, 0.0, 1.0]) - axis[2] * axis
         if np.linalg.norm(outward) < 0.1:
@@ -123,17 +132,20 @@ class Interceptor:
     ) -> Plan | None:
         """The best catching pose from the arm's state and limits (rad, rad/s, rad/s^2); None if no candidate can be reached."""
         prediction = prediction.shrunk(PRIOR_SPREAD)
-        points, fall, ways = self._fall(strategy, prediction)
+        layout = self._layout(strategy)
         axis = _against(prediction.velocity, strategy.tilt)
-        poses = self._poses(points, axis, strategy)
-        solved = self._puma.inverse(poses, (self._branch,), near=self._home)[:, 0]
+        fall = np.array(self._fall(strategy, prediction, axis))
+        points = fall[:, :3]
+        solved = self._puma.inverse(self._poses(points, axis, layout), (self._branch,), near=self._home)[:, 0]
         times = reach_time(solved - np.asarray(q), np.asarray(qd), np.asarray(speed), np.asarray(acceleration)).max(
             axis=1
         )
-        hands = len(strategy.hands)
-        arrival = np.repeat(prediction.time_to_go + fall, hands)
+        hands = layout.hands
+        arrival = prediction.time_to_go + np.repeat(fall[:, 3], hands)
         slack = arrival - strategy.margin - times
-        cost = self._cost(strategy, np.repeat(-(ways @ axis), hands), slack, times)
+        closed = CLOSED_COST * np.repeat(np.maximum(strategy.opening - fall[:, 4], 0.0), hands)
+        cost = times + layout.off_depth + closed + LATE_COST * np.maximum(-slack, 0.0) + np.maximum(EARLY - slack, 0.0)
+        cost[np.isnan(cost)] = np.inf
         if before is not None and before.candidate < len(cost):
             cost[before.candidate] -= KEEP
         for index in np.argsort(cost):
@@ -154,41 +166,52 @@ class Interceptor:
                 )
         return None
 
-    def _fall(self, strategy: Strategy, prediction: Prediction) -> tuple[Vector, Vector, Vector]:
-        """Points (n, 3) of the parabola at the strategy's depths, when the ball is there (n,; s after the edge), and its
-        direction there (n, 3; unit)."""
-        gravity = self._cell.gravity
-        depths = np.asarray(strategy.depths)
-        vx, vy, vz = prediction.velocity
-        fall = (vz + np.sqrt(vz * vz + 2.0 * gravity * depths)) / gravity
-        x, y, z = prediction.point
-        points = np.column_stack([x + vx * fall, y + vy * fall, z - depths])
-        ways = np.column_stack([np.full_like(fall, vx), np.full_like(fall, vy), vz - gravity * fall])
-        return points, fall, ways / np.linalg.norm(ways, axis=1, keepdims=True)
+    def _layout(self, strategy: Strategy) -> _Layout:
+        if strategy not in self._layouts:
+            self._layouts = {strategy: _Layout(strategy)}  # one at a time is in use
+        return self._layouts[strategy]
 
-    def _poses(self, points: Vector, axis: Vector, strategy: Strategy) -> Vector:
+    def _fall(self, strategy: Strategy, prediction: Prediction, axis: Vector) -> list[tuple[float, ...]]:
+        """Of each depth of the strategy: the parabola's point there (x, y, z; m), when the ball is there (s after the edge),
+        and the cosine between the cup's axis and the way that it comes from."""
+        gravity, (x, y, z), (vx, vy, vz) = self._cell.gravity, prediction.point, prediction.velocity
+        ax, ay, az = axis.tolist()
+        fall: list[tuple[float, ...]] = []
+        for depth in strategy.depths:
+            t = (vz + math.sqrt(vz * vz + 2.0 * gravity * depth)) / gravity
+            w = vz - gravity * t
+            opening = -(ax * vx + ay * vy + az * w) / math.sqrt(vx * vx + vy * vy + w * w)
+            fall.append((x + vx * t, y + vy * t, z - depth, t, opening))
+        return fall
+
+    def _poses(self, points: Vector, axis: Vector, layout: _Layout) -> Vector:
         """Poses (n * hands, 4, 4) of frame 6 with the cup's mouth at the points, its axis as given, in all turns of the hand."""
         ahead = np.array([1.0, 0.0, 0.0]) - axis[0] * axis
-        ahead /= np.linalg.norm(ahead)
-        side = np.cross(axis, ahead)
-        turns = np.asarray(strategy.hands)
-        cosine, sine = np.cos(turns)[:, None], np.sin(turns)[:, None]
-        outward, third = cosine * ahead + sine * side, cosine * side - sine * ahead
-        frames = np.stack([np.broadcast_to(axis, outward.shape), outward, third], axis=2)
+        ahead /= math.sqrt(float(ahead @ ahead))
+        x, y, z = axis.tolist()
+        side = np.array([y * ahead[2] - z * ahead[1], z * ahead[0] - x * ahead[2], x * ahead[1] - y * ahead[0]])
+        frames = layout.frames
+        frames[:, :, 0] = axis
+        frames[:, :, 1] = layout.cosine * ahead + layout.sine * side
+        frames[:, :, 2] = layout.cosine * side - layout.sine * ahead
         rotations = frames @ self._mount.T
-        poses = np.zeros((len(points), len(turns), 4, 4))
+        poses = layout.poses
         poses[..., :3, :3] = rotations
         poses[..., :3, 3] = points[:, None] - rotations @ self._mouth
-        poses[..., 3, 3] = 1.0
         return poses.reshape(-1, 4, 4)
 
-    def _cost(self, strategy: Strategy, opening: Vector, slack: Vector, times: Vector) -> Vector:
-        """Cost of each candidate, about in seconds; inf where it cannot be reached."""
-        depth = np.repeat(np.asarray(strategy.depths), len(strategy.hands))
-        cost = times + 2.0 * np.abs(depth - strategy.preferred)
-        cost += 4.0 * np.maximum(strategy.opening - opening, 0.0)
-        cost += 20.0 * np.maximum(-slack, 0.0) + np.maximum(0.05 - slack, 0.0)
-        return np.where(np.isnan(cost), np.inf, cost)
+
+class _Layout:
+    """Arrays of a strategy's candidates that do not depend on the prediction, and room for those that do."""
+
+    def __init__(self, strategy: Strategy) -> None:
+        turns = np.asarray(strategy.hands)
+        self.hands = len(turns)
+        self.cosine, self.sine = np.cos(turns)[:, None], np.sin(turns)[:, None]
+        self.off_depth = np.repeat(DEPTH_COST * np.abs(np.asarray(strategy.depths) - strategy.preferred), self.hands)
+        self.frames = np.empty((self.hands, 3, 3))
+        self.poses = np.zeros((len(strategy.depths), self.hands, 4, 4))
+        self.poses[..., 3, 3] = 1.0
 
 
 def _against(velocity: tuple[float, float, float], tilt: float) -> Vector:

@@ -1,8 +1,8 @@
 """The guard: joint limits, table, floor and pedestal that no set point can pass.
 
-A commanded step is allowed only if the pose in which the arm would come to rest, braking from after that step, is clear, and
-so is the way there at its middle. So at every moment the arm can stop without touching anything; where a step is refused the
-servo brakes on the way that was found clear one cycle before.
+A commanded step is allowed only if the pose in which the arm would come to rest, braking from after that step, is clear,
+and so is the middle of the way there if it is long. So at every moment the arm can stop without touching anything; where a
+step is refused the servo brakes on the way that was found clear one cycle before.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ CUP_MARGIN = 0.005
 """m between cup and table."""
 ARM_MARGIN = 0.01
 """m between arm and table, and of everything to floor and pedestal."""
+NEAR = 0.02
+"""rad of braking below which the way to rest is too short (10 mm at the cup) to need a look at its middle."""
 JOINT_SLACK = 1e-6
 """rad by which rounding may carry a command beyond a joint limit."""
 
@@ -105,7 +107,9 @@ class Guard:
         """
         q, qd = trajectory.proposed()
         rest = trajectory.resting(q, qd)
-        refused = self.violation(rest) or self.violation([0.5 * (a + b) for a, b in zip(q, rest, strict=True)])
+        refused = self.violation(rest)
+        if not refused and any(abs(b - a) > NEAR for a, b in zip(q, rest, strict=True)):
+            refused = self.violation([0.5 * (a + b) for a, b in zip(q, rest, strict=True)])
         if refused and not self.violation(trajectory.resting(trajectory.q, trajectory.qd)):
             trajectory.accept(*trajectory.braking())
             return refused

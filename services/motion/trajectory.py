@@ -28,12 +28,16 @@ def next_velocity(error: float, velocity: float, period: float, speed: float, ac
     quantum = acceleration * period
     left = error - 0.5 * velocity * period
     size = 2.0 * abs(left) / (quantum * period)
+    if size < RESIDUE and abs(velocity) <= quantum:
+        return 0.0
     cycles = math.ceil(0.5 * (math.sqrt(1.0 + 4.0 * size) - 1.0) - ROUNDING)
     wish = size / (cycles + 1.0) if size > cycles * cycles - 1.0 else cycles - 1.0
     wish = math.copysign(min(wish * quantum, speed), left)
     return min(max(wish, velocity - quantum), velocity + quantum)
 
 
+RESIDUE = 1e-6
+"""Share of one cycle's ramp that counts as arrived, so that rounding leaves no creeping; less than 1e-9 rad."""
 ROUNDING = 1e-9
 """Cycles by which rounding may carry a ramp of whole cycles; without it a ramp would restart one cycle longer each time."""
 
