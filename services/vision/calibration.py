@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 
 CORNER_SIGMA_PX = 0.07
 """px, accuracy of a chessboard corner (residual of calibrations at 3 grey levels of noise)."""
+CORNER_WINDOW = 5
+"""px, half width of the window in which a corner is refined; less than half a square's side in any view."""
 PLACEMENT_SIGMA = 0.0003
 """m, accuracy to which the place of a board on the table is known."""
 PLACEMENT_TURN = 0.0005
@@ -69,16 +71,16 @@ class Calibration:
     table_residual: float
     """m, rms distance on the board's plane between corners of the known views and their stated places."""
     table_sigma: float
-    """m, the largest standard deviation, from the fit's covariance, of a point of the seen plane."""
+    """m, standard deviation (from the fit's covariance) of a point of the table, rms over the image."""
 
 
 def find_corners(pixels: NDArray[np.uint8], board: Board) -> Array | None:
     """Inner corners (n, 2) px in the order of `Board.points`; None when the board is not seen whole."""
-    found, corners = cv2.findChessboardCornersSB(
-        pixels, (board.columns, board.rows), None, cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-    )
+    found, corners = cv2.findChessboardCornersSB(pixels, (board.columns, board.rows), None, cv2.CALIB_CB_ACCURACY)
     if not found or corners is None:
         return None
+    limit = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 40, 0.001)
+    corners = cv2.cornerSubPix(pixels, corners, (CORNER_WINDOW, CORNER_WINDOW), (-1, -1), limit)
     grid = np.asarray(corners, float).reshape(board.rows, board.columns, 2)
     if np.linalg.det(np.stack([grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]])) > 0.0:
         grid = grid[::-1]  # seen from the printed side, x to y turns left; image y points down
@@ -125,7 +127,7 @@ class _Adjustment:
     def solve(self) -> Calibration:
         """Start from calibrateCamera, refine all together, report residuals."""
         start = self._start()
-        fit = least_squares(self._residuals, start, x_scale="jac", method="trf", ftol=1e-12, xtol=1e-12)
+        fit = least_squares(self._residuals, start, self._slopes, method="lm", x_scale="jac", xtol=1e-10)
         if not fit.success:
             raise CalibrationError(f"the calibration does not converge ({fit.message}); take more and sharper images")
         optics = self._optics(fit.x)
@@ -173,6 +175,28 @@ class _Adjustment:
             parts.append((expected.reshape(-1, 2) - corners).ravel() / CORNER_SIGMA_PX)
         return np.concatenate(parts + priors)
 
+    def _slopes(self, unknown: Array) -> Array:
+        """Jacobian by central differences; a view's pose moves its own residuals only, so all views are moved at once."""
+        rows = 2 * len(self._points)
+        views = len(self._corners)
+        own_rows = np.arange(views * rows).reshape(views, rows)
+        slopes = np.zeros((len(self._residuals(unknown)), len(unknown)))
+        for k in range(LENS + 6):
+            step = np.zeros(len(unknown))
+            step[k] = 1e-6 * max(1.0, abs(unknown[k]))
+            slopes[:, k] = (self._residuals(unknown + step) - self._residuals(unknown - step)) / (2.0 * step[k])
+        for k in range(6):
+            columns = LENS + 6 + 6 * np.arange(views) + k
+            step = np.zeros(len(unknown))
+            step[columns] = 1e-6
+            change = (self._residuals(unknown + step) - self._residuals(unknown - step)) / 2e-6
+            for view, column in enumerate(columns):
+                slopes[own_rows[view], column] = change[own_rows[view]]
+            known = [column for column, pose in zip(columns, self._poses, strict=True) if pose is not None]
+            prior_rows = views * rows + 6 * np.arange(len(known)) + k
+            slopes[prior_rows, known] = change[prior_rows]
+        return slopes
+
     def _optics(self, unknown: Array) -> Optics:
         fx, fy, cx, cy, k1, k2, p1, p2 = (float(value) for value in unknown[:LENS])
         base = _pose(unknown[LENS : LENS + 3], unknown[LENS + 3 : LENS + 6])
@@ -200,7 +224,7 @@ class _Adjustment:
             moved[k] += step
             slopes[:, k] = (self._optics(moved).to_plane(grid, z).ravel() - middle) / step
         variances = np.einsum("ij,jk,ik->i", slopes, covariance, slopes).reshape(-1, 2)
-        return float(np.sqrt(variances.sum(axis=-1).max()))
+        return float(np.sqrt(variances.sum(axis=-1).mean()))
 
 
 def _pose(turn: Array, shift: Array) -> Array:

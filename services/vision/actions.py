@@ -1,0 +1,92 @@
+"""The camera's primitive actions: locate a rolling ball in four ways, track it and predict where it leaves in three ways.
+
+Every locator gives `ball`, plain data with which every tracker goes on: `places` rows [dt, x, y] (s relative to the image
+`sequence`, m, base frame), their accuracy `sigma` (m), and the `age` (s) of that image when the locator ended.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from services.action import Context, Result
+from services.vision.camera import Camera
+from services.vision.location import BackgroundSubtraction, Detector, FixedThreshold, HoughCircles, MixtureOfGaussians
+from services.vision.locating import LocateSpecification, locate
+from services.vision.prediction import ConstantVelocity, Kalman, LeastSquares, Predictor, Surface
+from services.vision.tracking import TrackSpecification, track
+
+
+def _background(camera: Camera) -> Detector:
+    return BackgroundSubtraction(camera.view, camera.background)
+
+
+def _mog2(camera: Camera) -> Detector:
+    return MixtureOfGaussians(camera.view)
+
+
+def _hough(camera: Camera) -> Detector:
+    return HoughCircles(camera.view)
+
+
+def _threshold(camera: Camera) -> Detector:
+    return FixedThreshold(camera.view)
+
+
+async def locate_background(ctx: Context, **options: float) -> Result:
+    """Locate a rolling ball by subtracting the stored picture of the empty table: accurate and cheap in steady light.
+
+    Options: those of `LocateSpecification`. SUCCESS and FAILURE (cause `inaccurate` or `late`) give `ball` and `images`;
+    ERROR has cause `no_ball`, `no_image` or `bad_image`.
+    """
+    return await locate(ctx, "background", _background, 0.0007, LocateSpecification.of(options))
+
+
+async def locate_mog2(ctx: Context, **options: float) -> Result:
+    """Locate a rolling ball by a mixture-of-Gaussians background (MOG2): follows changing light, costs most. As
+    `locate_background`."""
+    return await locate(ctx, "mog2", _mog2, 0.0022, LocateSpecification.of(options))
+
+
+async def locate_hough(ctx: Context, **options: float) -> Result:
+    """Locate a rolling ball as a moving circle: needs no background, coarse. As `locate_background`."""
+    return await locate(ctx, "hough", _hough, 0.0028, LocateSpecification.of(options))
+
+
+async def locate_threshold(ctx: Context, **options: float) -> Result:
+    """Locate a rolling ball as what is brighter than one grey level: cheapest, fails in uneven or dim light. As
+    `locate_background`."""
+    return await locate(ctx, "threshold", _threshold, 0.0015, LocateSpecification.of(options))
+
+
+async def _predict(
+    ctx: Context, make: Callable[[Surface], Predictor], ball: Mapping[str, Any], stream: str, options: dict[str, float]
+) -> Result:
+    return await track(ctx, make, ball, stream, TrackSpecification.of(options))
+
+
+async def predict_least_squares(
+    ctx: Context, *, ball: Mapping[str, Any], stream: str = "catch_point", **options: float
+) -> Result:
+    """Track the ball and stream its predicted exit by least squares with sliding and rolling deceleration.
+
+    Publishes [time_to_go, x, y, z, vx, vy, vz, sigma_y, sigma_t] (s, m, m/s) at each image until the ball leaves the table.
+    Options: those of `TrackSpecification`. SUCCESS: the predictions agreed in time; FAILURE: `unsteady`, `late`, `side_exit` or
+    `stays`; ERROR: `ball_lost`, `no_image`, `bad_image` or `bad_ball`. Values: `exit`, `images`, `seen`.
+    """
+    return await _predict(ctx, LeastSquares, ball, stream, options)
+
+
+async def predict_kalman(
+    ctx: Context, *, ball: Mapping[str, Any], stream: str = "catch_point", **options: float
+) -> Result:
+    """Track the ball and stream its predicted exit by an extended Kalman filter. As `predict_least_squares`."""
+    return await _predict(ctx, Kalman, ball, stream, options)
+
+
+async def predict_constant_velocity(
+    ctx: Context, *, ball: Mapping[str, Any], stream: str = "catch_point", **options: float
+) -> Result:
+    """Track the ball and stream its predicted exit at even speed: cheapest, late for slow balls. As
+    `predict_least_squares`."""
+    return await _predict(ctx, ConstantVelocity, ball, stream, options)

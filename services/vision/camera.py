@@ -1,0 +1,157 @@
+"""The driver of a camera over the table: starts and stops images, hands them to actions, keeps what was learned between runs."""
+
+from __future__ import annotations
+
+import tomllib
+from collections import deque
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from services.action import Context
+from services.comm.image import Image
+from services.device import Ports
+from services.vision.calibration_file import DEFAULT, parse_calibration
+from services.vision.location import Background, Detector
+from services.vision.prediction import Surface
+from services.vision.table import TableView
+
+CELL = Path(__file__).parents[1] / "cell.toml"
+REMEMBERED = 256
+"""Images whose times are remembered, for a tracker that goes on where a locator ended."""
+
+
+class CameraError(ValueError):
+    """The camera's config or its images cannot be used; the text says what to change."""
+
+
+class Camera:
+    """A device without cyclic duty. Its keys in services.toml, all optional but those of its source:
+
+    `calibration`: file beside services.toml (default: the simulated camera's); `cell`: the cell's data (default: the shipped one);
+    `rate`: images/s (default: the cell's); `threads`: for OpenCV (default 1: cores are shared with other nodes).
+    """
+
+    period: float | None = None
+
+    def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
+        self._ports = ports
+        self._images = ports.images()
+        cv2.setNumThreads(int(config.get("threads", 1)))
+        cell = _cell(config, ports)
+        name = str(config.get("calibration", ""))
+        text = ports.file(name).decode() if name else DEFAULT.read_text(encoding="utf-8")
+        self.calibration = parse_calibration(text, name or DEFAULT.name)
+        self.view = TableView.of(cell, self.calibration.optics)
+        self.surface = Surface.of(cell)
+        self.background = Background()
+        self.usual_rate = float(config.get("rate", cell["camera"]["rate"]))
+        if not 0.0 < self.usual_rate <= 1000.0:
+            raise CameraError(f"camera: rate = {self.usual_rate} images/s; give one between 0 and 1000, such as 50")
+        self._detectors: dict[str, Detector] = {}
+        self._times: deque[tuple[int, float]] = deque(maxlen=REMEMBERED)
+        self._newest: Image | None = None
+        self._rate = 0.0
+        self._count = 0
+
+    # For actions
+
+    @property
+    def rate(self) -> float:
+        """Images/s asked for now, 0 when none."""
+        return self._rate
+
+    def start(self, rate: float = 0.0) -> bool:
+        """Have images taken at `rate` (1/s; 0: the usual one). False when they went on at that rate already.
+
+        Raises ConnectionError when the source cannot be opened.
+        """
+        wanted = rate or self.usual_rate
+        if wanted == self._rate:
+            return False
+        self._newest = None
+        self._images.start(wanted)
+        self._rate = wanted
+        return True
+
+    def end(self) -> None:
+        """Take no more images."""
+        if self._rate:
+            self._images.stop()
+        self._rate, self._newest = 0.0, None
+
+    async def read(self, ctx: Context, timeout: float) -> Image | None:
+        """The newest image not read yet, None when none comes for `timeout` s. Raises CameraError for one of another size."""
+        await ctx.wait(self._arrived, timeout)
+        image, self._newest = self._newest, None
+        if image is None:
+            return None
+        if image.pixels.shape != (self.view.height_px, self.view.width_px):
+            high, wide = image.pixels.shape
+            raise CameraError(
+                f"the camera gives {wide}x{high} images, the cell's are {self.view.width_px}x{self.view.height_px}: "
+                "change [camera] of the cell and calibrate again"
+            )
+        self._count += 1
+        self._times.append((image.sequence, image.time))
+        return image
+
+    def _arrived(self) -> bool:
+        newest = self._images.newest()
+        if newest is not None:
+            self._newest = newest
+        return self._newest is not None
+
+    def time_of(self, sequence: int) -> float | None:
+        """Mid-exposure time (s) of an image read lately, None when it is not remembered."""
+        return next((time for number, time in reversed(self._times) if number == sequence), None)
+
+    def detector(self, name: str, make: Callable[[], Detector]) -> Detector:
+        """The detector of this name with all that it has learned; made at first use."""
+        if name not in self._detectors:
+            self._detectors[name] = make()
+        return self._detectors[name]
+
+    # For the node
+
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        """Cyclic drivers take commands; this one's actions use its methods."""
+        raise ValueError("the camera takes no commands; its actions read images")
+
+    def step(self, now: float) -> None:
+        """Nothing is due between images."""
+
+    def state(self) -> Mapping[str, Any]:
+        """Plain data for operator and report."""
+        return {"rate": self._rate, "images": self._count, "background_images": self.background.images}
+
+    def stop(self, now: float) -> None:
+        """Take no more images."""
+        self.end()
+
+    def stopped(self) -> bool:
+        """Whether no images are taken; a camera never moves."""
+        return self._rate == 0.0
+
+    def hold(self, now: float) -> str:
+        """A rolling ball does not wait: while images are taken the camera cannot hold."""
+        return "held" if self.stopped() else "cannot hold"
+
+    def release(self, now: float) -> None:
+        """Nothing was held."""
+
+    def close(self) -> None:
+        """Let the source go."""
+        self.end()
+        self._images.close()
+
+
+def _cell(config: Mapping[str, Any], ports: Ports) -> dict[str, Any]:
+    name = str(config.get("cell", ""))
+    text = ports.file(name).decode() if name else CELL.read_text(encoding="utf-8")
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as fault:
+        raise CameraError(f"{name or CELL.name}: no TOML ({fault}); mend that line") from fault

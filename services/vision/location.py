@@ -1,0 +1,311 @@
+"""Where the ball is in an image: four detectors over the whole table that differ in what they cost and what deceives them,
+and the measurement in a small window with which a known ball is tracked.
+
+Every detector takes an image (height, width) uint8 and gives candidates (n, 2): the ball's centre in pixels. They keep state
+of their own kind; time, cameras and the question which candidate is the ball (`confirmation.py`) are none of theirs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from services.vision.table import TableView
+
+Array = NDArray[np.float64]
+Pixels = NDArray[np.uint8]
+NOTHING: Array = np.empty((0, 2))
+
+HALF = 2
+"""Detectors over the whole table look at images of half the size first."""
+SMALLEST, LARGEST = 0.45, 1.9
+"""Area of a candidate, relative to the area that a ball (with the streak of the fastest one) covers."""
+ROUNDEST_FILL = 0.55
+"""A disc fills pi/4 of its bounding box, a streaked one more; scattered pixels and slanting stripes less."""
+FASTEST = 3.5
+"""m/s, the fastest ball that is looked for."""
+
+
+class Detector(Protocol):
+    """Candidates in one image."""
+
+    def detect(self, pixels: Pixels) -> Array:
+        """Candidate centres (n, 2) px."""
+
+
+class Background:
+    """Mean grey levels of the empty table, learned from images and kept between runs.
+
+    The first `first` images count equally, each later one `rate`: slow light is followed, a ball leaves no trace.
+    """
+
+    def __init__(self, first: int = 5, rate: float = 0.08) -> None:
+        self._first = first
+        self._rate = rate
+        self._mean: NDArray[np.float32] | None = None
+        self.images = 0
+        self.picture: Pixels | None = None
+        """The model as grey levels (height, width), None before the first image."""
+
+    @property
+    def known(self) -> bool:
+        """Whether enough images were learned to subtract."""
+        return self.images >= self._first
+
+    def learn(self, pixels: Pixels) -> None:
+        """Take an image into the mean."""
+        self.images += 1
+        if self._mean is None or self._mean.shape != pixels.shape:
+            self._mean, self.images = pixels.astype(np.float32), 1
+        else:
+            cv2.accumulateWeighted(pixels, self._mean, max(1.0 / self.images, self._rate))
+        self.picture = np.asarray(cv2.convertScaleAbs(self._mean), np.uint8)
+
+
+def ball_blobs(mask: Pixels, radius: float, streak: float) -> Array:
+    """Centroids (n, 2) of the regions of a mask (0 or 255) that have a ball's size and shape; radius and streak in its px."""
+    count, _, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    if count <= 1:
+        return NOTHING
+    area, wide, high = (stats[1:, k].astype(float) for k in (cv2.CC_STAT_AREA, cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT))
+    disc = np.pi * radius * radius
+    largest = 2.0 * radius * 1.35 + streak + 2.0
+    good = (
+        (area > SMALLEST * disc)
+        & (area < LARGEST * disc + 2.0 * radius * streak)
+        & (np.maximum(wide, high) < largest)
+        & (np.minimum(wide, high) > 0.9 * radius)
+        & (area > ROUNDEST_FILL * wide * high)
+    )
+    return np.asarray(centres[1:][good], float)
+
+
+class _WholeTable:
+    """What detectors over the whole table share: the cut-out of the table, at half size, and the way back to pixels."""
+
+    def __init__(self, view: TableView) -> None:
+        self.view = view
+        rows, columns = view.region
+        self._rows, self._columns = rows, columns
+        self._corner = np.array([columns.start, rows.start], float)
+        self._half_size = ((columns.stop - columns.start) // HALF, (rows.stop - rows.start) // HALF)
+
+    def half(self, pixels: Pixels) -> Pixels:
+        """The table at half the size, each pixel the mean of four."""
+        return np.asarray(
+            cv2.resize(pixels[self._rows, self._columns], self._half_size, interpolation=cv2.INTER_AREA), np.uint8
+        )
+
+    def blobs(self, mask: Pixels) -> Array:
+        """Ball-like regions of a half-size mask, as pixels of the image, on the table only."""
+        streak = self.view.streak_px(FASTEST) / HALF
+        return self.on_table(self.from_half(ball_blobs(mask, self.view.radius_px / HALF, streak)))
+
+    def from_half(self, centres: Array) -> Array:
+        """Pixels of the image from those of the half-size cut-out (pixel centres at whole numbers in both)."""
+        return np.asarray(centres * HALF + (HALF - 1) / 2.0 + self._corner)
+
+    def on_table(self, pixels: Array) -> Array:
+        """Those whose place is on the table."""
+        return pixels[self.view.on_table(self.view.to_table(pixels))] if len(pixels) else pixels
+
+
+class BackgroundSubtraction(_WholeTable):
+    """What is brighter than the stored picture of the empty table. Cheap and accurate; blind when the light has changed by
+    more than its threshold since the picture was learned."""
+
+    THRESHOLD = 24.0
+    """Grey levels: 16 sigma of the half-size noise, a fifth of a ball's contrast in full light."""
+
+    def __init__(self, view: TableView, background: Background) -> None:
+        super().__init__(view)
+        self._background = background
+        self._window = Window(view)
+
+    def detect(self, pixels: Pixels) -> Array:
+        """Candidates, refined to parts of a pixel; none before the background is known."""
+        picture = self._background.picture
+        if picture is None or not self._background.known:
+            return NOTHING
+        brighter = cv2.subtract(self.half(pixels), self.half(picture))
+        mask = cv2.threshold(brighter, self.THRESHOLD, 255, cv2.THRESH_BINARY)[1]
+        found = []
+        for centre in self.blobs(np.asarray(mask, np.uint8)):
+            seen = self._window.measure(pixels, picture, centre, streak=self.view.streak_px(FASTEST))
+            if seen is not None:
+                found.append(seen.centre)
+        return np.array(found) if found else NOTHING
+
+
+class MixtureOfGaussians(_WholeTable):
+    """OpenCV's MOG2 (Zivkovic 2004): several grey levels a pixel, each with its own spread, learned all the time. Follows
+    changing light; costs most, and needs some images before it knows the table."""
+
+    WARM_UP = 6
+
+    def __init__(self, view: TableView) -> None:
+        super().__init__(view)
+        self._model: Any = cv2.createBackgroundSubtractorMOG2(history=60, varThreshold=30.0, detectShadows=True)
+        self._images = 0
+
+    def forget(self) -> None:
+        """Images stopped for a while: learn quickly again."""
+        self._images = 0
+
+    def detect(self, pixels: Pixels) -> Array:
+        """Candidates, accurate to about half a pixel; none during the first images."""
+        self._images += 1
+        rate = 0.4 if self._images <= 3 else 0.04
+        mask = self._model.apply(self.half(pixels), None, rate)
+        if self._images < self.WARM_UP:
+            return NOTHING
+        mask = cv2.threshold(mask, 200, 255, cv2.THRESH_BINARY)[1]  # shadows are marked 127
+        return self.blobs(np.asarray(cv2.medianBlur(mask, 3), np.uint8))
+
+
+class HoughCircles(_WholeTable):
+    """Circles of the ball's size by OpenCV's gradient Hough transform. Needs no background and no certain light; coarse, and
+    every round thing is a candidate."""
+
+    EDGE, VOTES = 60.0, 11.0
+    MOST = 12
+
+    def detect(self, pixels: Pixels) -> Array:
+        """The most voted circles."""
+        radius = self.view.radius_px
+        smooth = cv2.GaussianBlur(pixels[self._rows, self._columns], (5, 5), 1.2)
+        circles = cv2.HoughCircles(
+            smooth,
+            cv2.HOUGH_GRADIENT,
+            dp=1.5,
+            minDist=3.0 * radius,
+            param1=self.EDGE,
+            param2=self.VOTES,
+            minRadius=int(0.7 * radius),
+            maxRadius=int(1.4 * radius) + 1,
+        )
+        if circles is None:
+            return NOTHING
+        return self.on_table(np.asarray(circles, float).reshape(-1, 3)[: self.MOST, :2] + self._corner)
+
+
+class FixedThreshold(_WholeTable):
+    """All that is brighter than one grey level. Cheapest, needs no background; fails where the light is uneven or changes."""
+
+    def __init__(self, view: TableView, level: float = 140.0) -> None:
+        super().__init__(view)
+        self._level = level
+
+    def detect(self, pixels: Pixels) -> Array:
+        """Candidates, accurate to about half a pixel."""
+        mask = cv2.threshold(self.half(pixels), self._level, 255, cv2.THRESH_BINARY)[1]
+        return self.blobs(np.asarray(mask, np.uint8))
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """A ball measured in a window: `centre` (2,) px, `cover`: seen area relative to the expected one."""
+
+    centre: Array
+    cover: float
+
+
+class Window:
+    """Measures a ball whose place is about known. The light's change since the background was learned is taken from the
+    window itself; a ball partly hidden by arm or cup, or merged with them, is not measured."""
+
+    CONTRAST = 25.0
+    """Grey levels that a ball is brighter than the background at least."""
+    LEAST_COVER, MOST_COVER = 0.72, 1.30
+
+    def __init__(self, view: TableView) -> None:
+        self.view = view
+
+    def measure(
+        self, pixels: Pixels, background: Pixels, expected: Array, streak: float = 0.0, spread: float = 4.0
+    ) -> Seen | None:
+        """The ball nearest to `expected` (2,) px, at most `spread` px away; `streak`: its longest way during the exposure (px).
+
+        None where no ball is seen whole.
+        """
+        radius = self.view.radius_px
+        reach = int(np.ceil(spread + 1.5 * radius + streak / 2.0 + 3.0))
+        box = self._box(expected, reach)
+        if box is None:
+            return None
+        cover = self._cover(pixels[box], background[box])
+        if cover is None:
+            return None
+        mask = (cover > 0.5).view(np.uint8)
+        count, labels, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=8)
+        if count <= 1:
+            return None
+        middle = expected - (box[1].start, box[0].start)
+        disc = np.pi * radius * radius
+        best = self._nearest(
+            stats[1:, cv2.CC_STAT_AREA],
+            np.asarray(centres[1:], float),
+            middle,
+            disc,
+            disc + 2.0 * radius * streak,
+            spread,
+        )
+        if best is None:
+            return None
+        return self._centroid(cover, labels == best + 1, stats[best + 1], box)
+
+    def _box(self, expected: Array, reach: int) -> tuple[slice, slice] | None:
+        u, v = round(float(expected[0])), round(float(expected[1]))
+        left, top = max(0, u - reach), max(0, v - reach)
+        right, bottom = min(self.view.width_px, u + reach + 1), min(self.view.height_px, v + reach + 1)
+        if right - left < reach or bottom - top < reach:
+            return None
+        return slice(top, bottom), slice(left, right)
+
+    def _cover(self, region: Pixels, background: Pixels) -> NDArray[np.float32] | None:
+        """How much of each pixel the ball covers: 0 background, 1 ball; from its own grey level where it is brightest."""
+        gain = _median(region) / max(_median(background), 1.0)
+        empty = background.astype(np.float32) * gain
+        brighter = region - empty
+        smooth = cv2.blur(brighter, (3, 3))
+        peak = float(smooth.max())
+        if peak < self.CONTRAST:
+            return None
+        level = float(region[smooth > 0.6 * peak].mean())
+        return np.asarray(brighter / np.maximum(level - empty, self.CONTRAST), np.float32)
+
+    def _nearest(
+        self, area: NDArray[Any], centres: Array, middle: Array, smallest: float, largest: float, spread: float
+    ) -> int | None:
+        """The region of a whole ball's area that is nearest to the expected place."""
+        away = np.hypot(centres[:, 0] - middle[0], centres[:, 1] - middle[1])
+        good = (area > self.LEAST_COVER * smallest) & (area < self.MOST_COVER * largest) & (away <= spread)
+        if not good.any():
+            return None
+        return int(np.argmin(np.where(good, away, np.inf)))
+
+    def _centroid(
+        self, cover: NDArray[np.float32], mine: NDArray[np.bool_], stats: NDArray[Any], box: tuple[slice, slice]
+    ) -> Seen | None:
+        left, top, wide, high, area = (int(value) for value in stats)
+        if left == 0 or top == 0 or left + wide == cover.shape[1] or top + high == cover.shape[0]:
+            return None  # cut by the window or the image's border
+        part = slice(top - 1, top + high + 1), slice(left - 1, left + wide + 1)
+        # pixels of the rim count by the part that is covered, all others fully, also on the ball's shaded side
+        weight = np.clip((cover[part] - 0.15) / 0.30, 0.0, 1.0)
+        weight *= cv2.dilate(mine[part].view(np.uint8), np.ones((3, 3), np.uint8))
+        total = float(weight.sum())
+        u = float(weight.sum(axis=0) @ np.arange(left - 1, left + wide + 1)) / total
+        v = float(weight.sum(axis=1) @ np.arange(top - 1, top + high + 1)) / total
+        centre = np.array([u + box[1].start, v + box[0].start])
+        return Seen(centre, area / (np.pi * self.view.radius_px**2))
+
+
+def _median(region: Pixels) -> float:
+    """Median of every third grey level along both axes."""
+    sample = region[::3, ::3].ravel()
+    return float(np.partition(sample, sample.size // 2)[sample.size // 2])

@@ -1,0 +1,369 @@
+"""Where and when a rolling ball leaves the table, from where it was seen: three predictors of different effort.
+
+A ball on a table first slides while its spin is less than that of pure rolling (a hollow ball with spin share s settles at
+(3 + 2 s) / 5 of its speed), then rolls and loses a constant c g of speed a second, on a straight line all the while. The
+coefficient c is known to +-30 % only; sliding ends some tenths of a second after the release. Pure; s, m, base frame.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+SLIDING, SLIDING_SIGMA = 2.5, 1.5
+"""m/s^2, deceleration of a sliding ball before anything is known: friction coefficient 0.25 +- 0.15."""
+
+
+class Way(StrEnum):
+    """How a ball leaves the table, if it does."""
+
+    NEAR_EDGE = "near_edge"
+    SIDE = "side"
+    STAYS = "stays"
+    """It stops before an edge, or rolls away from the near one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Exit:
+    """Prediction of where the ball's centre passes the edge: `time` on the observations' clock, `point` and `velocity` (2,),
+    standard deviations of the time and of the place along the edge. For `Way.STAYS` time is inf."""
+
+    way: Way
+    time: float
+    point: Array
+    velocity: Array
+    sigma_time: float
+    sigma_place: float
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """The table as the ball's centre meets it, and how it slows the ball. `rolling` and `rolling_sigma`: deceleration of a
+    rolling ball and how uncertain it is (m/s^2); `noise`: standard deviation of a seen place (m)."""
+
+    near_edge: float
+    half_width: float
+    rolling: float
+    rolling_sigma: float
+    noise: float = 0.0005
+
+    @classmethod
+    def of(cls, cell: Mapping[str, Any], spread: float = 0.30) -> Surface:
+        """From the cell's data; `spread`: the rolling resistance lies evenly within +- this part of the nominal."""
+        table, ball = cell["table"], cell["ball"]
+        rolling = float(ball["rolling_resistance"]) * float(ball["gravity"])
+        return cls(float(table["near_edge"]), float(table["width"]) / 2.0, rolling, spread / np.sqrt(3.0) * rolling)
+
+    def gap(self, place: Array, heading: Array) -> tuple[float, Way]:
+        """Way along `heading` (2,) from `place` (2,) to the edge that comes first, and which one; inf when none does."""
+        side = np.inf
+        if abs(heading[1]) > 1e-9:
+            side = (np.copysign(self.half_width, heading[1]) - place[1]) / heading[1]
+        if heading[0] > -1e-9:
+            return (float(side), Way.SIDE) if np.isfinite(side) else (float("inf"), Way.STAYS)
+        near = (self.near_edge - place[0]) / heading[0]
+        return (float(near), Way.NEAR_EDGE) if near <= side else (float(side), Way.SIDE)
+
+
+class Predictor(Protocol):
+    """Takes places one by one and predicts at any time. Costs the same for every observation."""
+
+    @property
+    def count(self) -> int:
+        """Observations taken."""
+
+    def add(self, time: float, x: float, y: float, sigma: float | None = None) -> None:
+        """Take the place where the ball was seen, with its standard deviation (m; None: the surface's); times rise."""
+
+    def place(self, time: float) -> Array:
+        """Where the ball is expected (2,). Needs two observations."""
+
+    def exit(self) -> Exit | None:
+        """How it leaves the table; None before three observations."""
+
+
+class ConstantVelocity:
+    """A straight line of even speed through the last places. The cheapest; knows neither sliding nor rolling resistance."""
+
+    def __init__(self, surface: Surface, last: int = 10) -> None:
+        self._surface = surface
+        self._rows: deque[tuple[float, float, float]] = deque(maxlen=last)
+        self.count = 0
+
+    def add(self, time: float, x: float, y: float, sigma: float | None = None) -> None:
+        """Take a place (m) seen at a time (s); all count the same."""
+        self._rows.append((time, x, y))
+        self.count += 1
+
+    def _fit(self) -> tuple[Array, Array, float]:
+        rows = np.array(self._rows)
+        middle = rows.mean(axis=0)
+        off = rows - middle
+        square = float(off[:, 0] @ off[:, 0])
+        return middle, off[:, 0] @ off[:, 1:] / max(square, 1e-12), square
+
+    def place(self, time: float) -> Array:
+        """Where the ball is expected (2,) m."""
+        middle, velocity, _ = self._fit()
+        return np.asarray(middle[1:] + velocity * (time - middle[0]))
+
+    def exit(self) -> Exit | None:
+        """How it leaves the table."""
+        if len(self._rows) < 3:
+            return None
+        middle, velocity, square = self._fit()
+        speed = float(np.hypot(*velocity))
+        heading = velocity / max(speed, 1e-9)
+        gap, way = self._surface.gap(middle[1:], heading)
+        if way is Way.STAYS or speed < 1e-3:
+            return _stays(middle[1:], velocity)
+        ahead = gap / speed
+        sigma = self._surface.noise * float(np.sqrt(1.0 / len(self._rows) + ahead * ahead / square))
+        facing = abs(heading[0] if way is Way.NEAR_EDGE else heading[1])
+        return Exit(
+            way,
+            float(middle[0]) + ahead,
+            middle[1:] + gap * heading,
+            velocity,
+            sigma / speed,
+            sigma / facing,
+        )
+
+
+def _stays(place: Array, velocity: Array) -> Exit:
+    return Exit(Way.STAYS, float("inf"), place, velocity, float("inf"), float("inf"))
+
+
+class LeastSquares:
+    """Least squares over all places since the ball was first seen: a straight line in space; along it a start, a speed, the
+    rolling deceleration (known to its prior), and sliding until one of several moments.
+
+    Each moment is a linear model with its own normal equations, kept up by addition; models are weighed by their evidence
+    (Bayesian model averaging), so no moment has to be guessed and the effort for a place never grows.
+    """
+
+    MOMENTS = np.array([0.0, 0.04, 0.08, 0.12, 0.16, 0.20, 0.25, 0.30, 0.36])
+    """s after the first place: sliding ends there."""
+
+    def __init__(self, surface: Surface, rolling_sigma: float | None = None) -> None:
+        """`rolling_sigma`: 0 takes the surface's rolling deceleration for known; None takes its uncertainty."""
+        self._surface = surface
+        sigma = max(surface.rolling_sigma if rolling_sigma is None else rolling_sigma, 1e-6)
+        self._prior = np.array([0.0, 0.0, sigma**-2.0, SLIDING_SIGMA**-2.0])
+        self._mean = np.array([0.0, 0.0, surface.rolling, SLIDING])
+        models = len(self.MOMENTS)
+        self._A = np.zeros((models, 4, 4))
+        self._b = np.zeros((models, 4, 2))
+        self._weight = 0.0
+        self._sum = np.zeros(2)
+        self._squares = np.zeros((2, 2))
+        self._origin = np.zeros(3)
+        self._solved: tuple[Array, Array, Array, Array] | None = None
+        self.count = 0
+
+    def _basis(self, t: float) -> Array:
+        """(models, 4): start, speed, rolling and sliding deceleration."""
+        rest = np.maximum(self.MOMENTS - t, 0.0)
+        basis = np.empty((len(rest), 4))
+        basis[:, 0], basis[:, 1], basis[:, 2], basis[:, 3] = 1.0, t, -0.5 * t * t, -0.5 * rest * rest
+        return basis
+
+    def add(self, time: float, x: float, y: float, sigma: float | None = None) -> None:
+        """Take a place (m) seen at a time (s) with a standard deviation (m)."""
+        if self.count == 0:
+            self._origin = np.array([time, x, y])
+        t, place = time - self._origin[0], np.array([x, y]) - self._origin[1:]
+        weight = 1.0 if sigma is None else (self._surface.noise / sigma) ** 2
+        basis = self._basis(t)
+        self._A += weight * basis[:, :, None] * basis[:, None, :]
+        self._b += weight * basis[:, :, None] * place
+        self._weight += weight
+        self._sum += weight * place
+        self._squares += weight * np.outer(place, place)
+        self.count += 1
+        self._solved = None
+
+    def _heading(self) -> Array:
+        """Direction of the ball's straight way: principal axis of the places, turned the way the ball goes."""
+        scatter = self._squares - np.outer(self._sum, self._sum) / self._weight
+        axis = np.linalg.eigh(scatter)[1][:, 1]
+        # the speed's normal equation of the model without sliding says which way
+        t_mean = self._A[0, 0, 1] / self._weight
+        forward = (self._b[0, 1] - t_mean * self._b[0, 0]) @ axis
+        return np.asarray(axis if forward >= 0.0 else -axis)
+
+    def _solve(self) -> tuple[Array, Array, Array, Array]:
+        """Heading (2,), each model's solution (m, 4), covariance (m, 4, 4) and weight (m,)."""
+        if self._solved is None:
+            heading, precision = self._heading(), self._surface.noise**-2.0
+            P = self._A * precision + np.diag(self._prior)
+            b = (self._b @ heading) * precision + self._prior * self._mean
+            covariance = np.linalg.inv(P)
+            solution = np.einsum("mij,mj->mi", covariance, b)
+            # evidence of a linear model with Gaussian prior; the terms that all models share are left out
+            evidence = 0.5 * (np.einsum("mi,mi->m", solution, b) - np.linalg.slogdet(P)[1])
+            weight = np.exp(evidence - evidence.max())
+            self._solved = heading, solution, covariance, weight / weight.sum()
+        return self._solved
+
+    def place(self, time: float) -> Array:
+        """Where the ball is expected (2,) m."""
+        heading, solution, _, weight = self._solve()
+        t = time - self._origin[0]
+        along = float(weight @ np.einsum("mi,mi->m", self._basis(t), solution))
+        middle = self._sum / self._weight
+        return np.asarray(self._origin[1:] + middle + heading * (along - middle @ heading))
+
+    def exit(self) -> Exit | None:
+        """How it leaves the table."""
+        if self.count < 3:
+            return None
+        heading, solution, covariance, weight = self._solve()
+        middle = self._sum / self._weight
+        gap, way = self._surface.gap(self._origin[1:] + middle, heading)
+        if way is Way.STAYS:
+            return _stays(self._origin[1:] + middle, np.zeros(2))
+        along = gap + float(middle @ heading)
+        ahead, speed, variance = self._arrivals(along, solution, covariance)
+        usual = np.isfinite(ahead)
+        if weight @ usual < 0.5:
+            return _stays(self._origin[1:] + middle, np.zeros(2))
+        weight, ahead, speed = weight[usual] / weight[usual].sum(), ahead[usual], speed[usual]
+        mean = float(weight @ ahead)
+        sigma = float(np.sqrt(weight @ (variance[usual] + (ahead - mean) ** 2)))
+        facing = abs(heading[0] if way is Way.NEAR_EDGE else heading[1])
+        return Exit(
+            way,
+            float(self._origin[0]) + mean,
+            self._origin[1:] + middle + gap * heading,
+            heading * float(weight @ speed),
+            sigma,
+            self._place_sigma(heading, gap) / facing,
+        )
+
+    def _arrivals(self, along: float, solution: Array, covariance: Array) -> tuple[Array, Array, Array]:
+        """Time, speed and variance of the time at which each model's ball has gone `along` m; inf where it stops before."""
+        start, speed, rolling, _ = solution.T
+        under = speed * speed - 2.0 * rolling * (along - start)
+        last = np.sqrt(np.maximum(under, 1e-6))
+        ahead = np.where((under > 0.0) & (speed > 0.0), 2.0 * (along - start) / np.maximum(speed + last, 1e-6), np.inf)
+        t = np.where(np.isfinite(ahead), ahead, 0.0)
+        slope = np.stack([np.ones_like(t), t, -0.5 * t * t, -0.5 * np.maximum(self.MOMENTS - t, 0.0) ** 2], axis=-1)
+        return ahead, last, np.einsum("mi,mij,mj->m", slope, covariance, slope) / last**2
+
+    def _place_sigma(self, heading: Array, gap: float) -> float:
+        """Standard deviation, across the way, of the point `gap` m beyond the middle of the places."""
+        scatter = heading @ (self._squares - np.outer(self._sum, self._sum) / self._weight) @ heading
+        return self._surface.noise * float(np.sqrt(1.0 / self._weight + gap * gap / max(float(scatter), 1e-9)))
+
+
+class Kalman:
+    """Extended Kalman filter over place, velocity, rolling deceleration and what sliding adds to it, which dies away.
+
+    State: x, y, vx, vy, rolling, sliding. Sliding ends at a moment that the filter does not know; it is taken to decay with
+    `FADE` seconds while its noise lets the filter follow the true, sudden end.
+    """
+
+    FADE = 0.10
+    """s."""
+    SLIDING_NOISE = 1.2
+    """m/s^2 per root s, driving the sliding deceleration; less and less as time goes by."""
+    VELOCITY_NOISE = 0.002
+    """m/s per root s: an uneven table."""
+
+    def __init__(self, surface: Surface) -> None:
+        self._surface = surface
+        self._x = np.zeros(6)
+        self._P = np.zeros((6, 6))
+        self._time = 0.0
+        self._first = 0.0
+        self.count = 0
+
+    def add(self, time: float, x: float, y: float, sigma: float | None = None) -> None:
+        """Take a place (m) seen at a time (s) with a standard deviation (m)."""
+        variance = (self._surface.noise if sigma is None else sigma) ** 2
+        if self.count == 0:
+            self._x = np.array([x, y, 0.0, 0.0, self._surface.rolling, 0.5 * SLIDING])
+            place = np.sqrt(variance)
+            self._P = np.diag(np.square([place, place, 4.0, 4.0, self._surface.rolling_sigma, SLIDING]))
+            self._first = time
+        else:
+            self._x, self._P = self._ahead(time - self._time)
+            H = np.eye(2, 6)
+            S = self._P[:2, :2] + variance * np.eye(2)
+            K = self._P[:, :2] @ np.linalg.inv(S)
+            self._x = self._x + K @ (np.array([x, y]) - self._x[:2])
+            rest = np.eye(6) - K @ H
+            self._P = rest @ self._P @ rest.T + variance * (K @ K.T)  # Joseph's form keeps it symmetric and positive
+        self._time = time
+        self.count += 1
+
+    def _ahead(self, step: float) -> tuple[Array, Array]:
+        """State and covariance `step` s later."""
+        velocity = self._x[2:4]
+        heading = velocity / max(float(np.hypot(*velocity)), 1e-9)
+        fade = float(np.exp(-step / self.FADE))
+        lost = self.FADE * (1.0 - fade)
+        F = np.eye(6)
+        F[0, 2] = F[1, 3] = step
+        F[0:2, 4] = -0.5 * step * step * heading
+        F[2:4, 4] = -step * heading
+        F[0:2, 5] = -self.FADE * (step - lost) * heading
+        F[2:4, 5] = -lost * heading
+        F[5, 5] = fade
+        Q = np.zeros((6, 6))
+        Q[2, 2] = Q[3, 3] = self.VELOCITY_NOISE**2 * step
+        age = self._time - self._first
+        Q[5, 5] = self.SLIDING_NOISE**2 * step * float(np.exp(-age / 0.15))
+        return F @ self._x, F @ self._P @ F.T + Q
+
+    def place(self, time: float) -> Array:
+        """Where the ball is expected (2,) m."""
+        return np.asarray(self._ahead(time - self._time)[0][:2])
+
+    def exit(self) -> Exit | None:
+        """How it leaves the table."""
+        if self.count < 3:
+            return None
+        velocity = self._x[2:4]
+        speed = float(np.hypot(*velocity))
+        heading = velocity / max(speed, 1e-9)
+        gap, way = self._surface.gap(self._x[:2], heading)
+        ahead = self._arrival(gap, speed) if way is not Way.STAYS else float("inf")
+        if not np.isfinite(ahead):
+            return _stays(self._x[:2].copy(), velocity.copy())
+        state, covariance = self._ahead(ahead)
+        last = max(float(np.hypot(*state[2:4])), 1e-6)
+        along = float(heading @ covariance[:2, :2] @ heading)
+        normal = np.array([-heading[1], heading[0]])
+        across = float(normal @ covariance[:2, :2] @ normal)
+        facing = abs(heading[0] if way is Way.NEAR_EDGE else heading[1])
+        return Exit(
+            way,
+            self._time + ahead,
+            self._x[:2] + gap * heading,
+            state[2:4],
+            float(np.sqrt(along)) / last,
+            float(np.sqrt(across)) / facing,
+        )
+
+    def _arrival(self, gap: float, speed: float) -> float:
+        """Seconds until the ball has gone `gap` m, by Newton's method; inf when it stops before."""
+        rolling, sliding = float(self._x[4]), float(self._x[5])
+        t = gap / max(speed, 1e-6)
+        for _ in range(6):
+            fade = float(np.exp(-max(t, 0.0) / self.FADE))
+            lost = self.FADE * (1.0 - fade)
+            now = speed - rolling * t - sliding * lost
+            if now < 0.02:
+                return float("inf")
+            t -= (speed * t - 0.5 * rolling * t * t - sliding * self.FADE * (t - lost) - gap) / now
+        return t
