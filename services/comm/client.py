@@ -29,7 +29,7 @@ class _ClientLink(Link):
     def __init__(self, client: Client) -> None:
         super().__init__(Side.CLIENT, client.key, client.timing, client.limits)
         self._client = client
-        self.finished = self.loop.create_future()
+        self.finished = asyncio.Event()
         self.refusal: Refuse | None = None
         self.welcome = False
 
@@ -60,8 +60,7 @@ class _ClientLink(Link):
             self.refusal = Refuse(fault.code, fault.text)
 
     def over(self, now: float) -> None:
-        if not self.finished.done():
-            self.finished.set_result(None)
+        self.finished.set()
         self._client.gone(now, self)
 
 
@@ -121,7 +120,7 @@ class Client:
         link = self._link
         if link is not None:
             link.end(text, Bye(text) if link.connection.state is State.OPEN else None)
-            await link.finished
+            await link.finished.wait()
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -213,7 +212,7 @@ class Client:
         while True:
             link = await self._connect()
             if link is not None:
-                await link.finished
+                await link.finished.wait()
                 if link.welcome:
                     pause = first
             # A little chance, so that many clients do not come back in one moment.

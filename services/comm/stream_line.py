@@ -1,0 +1,144 @@
+"""One end of a set-point stream: its connection without waiting, and what of the arrived counts."""
+
+from __future__ import annotations
+
+import math
+import secrets
+import socket
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+from services.comm.messages import Message, SetPoint, Withdraw
+from services.comm.security import NONCE_BYTES
+from services.comm.wire import Connection, Side
+
+STALE_AFTER: Final = 3
+"""Periods after which a set point is too old."""
+
+_DRIFT: Final = 1e-4
+"""How much two clocks may drift apart (s/s); quartz is ten times better."""
+_CHUNK: Final = 1 << 14
+_READS: Final = 16
+"""Reads of one connection in a poll: a flood must not hold up the servo loop that polls."""
+
+
+class Sink(Protocol):
+    """Where the newest set point of a stream goes."""
+
+    def take(self, values: Sequence[float], held: float = 0.0) -> None:
+        """A set point has arrived, `held` seconds after its sender first sent these values."""
+
+    def withdraw(self) -> None:
+        """The sender stands by it no more, or is gone."""
+
+
+class Lateness:
+    """How much longer a message took than the quickest one of its stream: from arrivals and the sender's own durations."""
+
+    __slots__ = ("_at", "_best")
+
+    def __init__(self) -> None:
+        self._best = math.inf
+        self._at = 0.0
+
+    def of(self, now: float, elapsed: float) -> float:
+        """Seconds that a message sent `elapsed` seconds into the stream has lost on its way when it arrives at `now`."""
+        offset = now - elapsed
+        # The quickest passage is forgotten at the rate at which clocks may drift, so an old one cannot make all look late.
+        self._best = min(self._best + _DRIFT * (now - self._at), offset)
+        self._at = now
+        return offset - self._best
+
+
+class Inlet:
+    """Receiving end of one open stream, without socket or clock: what has been delayed too long is left out."""
+
+    __slots__ = ("_late", "_lateness", "_limit", "_sink")
+
+    def __init__(self, period: float, sink: Sink) -> None:
+        self._limit = STALE_AFTER * period
+        self._sink = sink
+        self._lateness = Lateness()
+        self._late = 0
+
+    @property
+    def late(self) -> int:
+        """How many came more than three periods late and were left out."""
+        return self._late
+
+    def receive(self, now: float, messages: Sequence[Message]) -> None:
+        """Take what has arrived by `now`: the newest counts, the others only show how late things are."""
+        newest: Message | None = None
+        late = 0.0
+        for message in messages:
+            if isinstance(message, SetPoint):
+                newest, late = message, self._lateness.of(now, message.elapsed)
+            elif isinstance(message, Withdraw):
+                newest = message
+        if isinstance(newest, Withdraw):
+            self._sink.withdraw()
+        elif isinstance(newest, SetPoint):
+            if late > self._limit:
+                self._late += 1
+            else:
+                self._sink.take(newest.values, newest.held + late)
+
+
+@dataclass(frozen=True, slots=True)
+class Incoming:
+    """A stream that a receiver takes: its period (s), where its values go, and what its sender must show."""
+
+    period: float
+    sink: Sink
+    ticket: str = ""
+
+
+class Line:
+    """One non-blocking connection, either end."""
+
+    def __init__(self, sock: socket.socket, side: Side, key: bytes | None) -> None:
+        sock.setblocking(False)
+        self.sock = sock
+        self.connection = Connection(side, key=key, nonce=secrets.token_bytes(NONCE_BYTES) if key is not None else b"")
+        self.unsent = b""
+
+    def tune(self) -> None:
+        """Small buffers and short timeouts: nothing old is to queue up here."""
+        sock = self.sock
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 1)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 1)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 1500)
+
+    def write(self, data: bytes) -> None:
+        """Send, or keep what finds no room now. Raises OSError when the connection is gone."""
+        data = self.unsent + data
+        self.unsent = b""
+        if not data:
+            return
+        try:
+            sent = self.sock.send(data)
+        except BlockingIOError:
+            sent = 0
+        self.unsent = data[sent:]
+
+    def read(self) -> list[Message]:
+        """Messages that have arrived. Raises OSError when the connection is gone, ProtocolError when it is no good."""
+        messages: list[Message] = []
+        for _ in range(_READS):
+            try:
+                data = self.sock.recv(_CHUNK)
+            except BlockingIOError:
+                break
+            if not data:
+                raise ConnectionResetError("the other side hung up")
+            messages += self.connection.receive_data(data)
+            if out := self.connection.data_to_send():
+                self.write(out)
+            if len(data) < _CHUNK:
+                break
+        return messages
