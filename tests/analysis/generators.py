@@ -1,0 +1,53 @@
+"""Nets that tests and benchmarks share: generated families of the literature and random small nets."""
+
+from __future__ import annotations
+
+from coordinator.net import Net
+
+Weights = dict[str, int]
+
+
+def kanban(n: int) -> Net:
+    """Kanban system with n cards in each of four cells: 16 places, 16 transitions (Ciardo & Tilgner 1996)."""
+    places: Weights = {}
+    arcs: dict[str, tuple[Weights, Weights]] = {}
+    for i in range(1, 5):
+        places |= {f"pm{i}": 0, f"pback{i}": 0, f"pkan{i}": n, f"pout{i}": 0}
+        arcs[f"tredo{i}"] = ({f"pm{i}": 1}, {f"pback{i}": 1})
+        arcs[f"tback{i}"] = ({f"pback{i}": 1}, {f"pm{i}": 1})
+        arcs[f"tok{i}"] = ({f"pm{i}": 1}, {f"pout{i}": 1})
+    arcs["tin1"] = ({"pkan1": 1}, {"pm1": 1})
+    arcs["tsynch123"] = (
+        {"pout1": 1, "pkan2": 1, "pkan3": 1},
+        {"pkan1": 1, "pm2": 1, "pm3": 1},
+    )
+    arcs["tsynch234"] = (
+        {"pout2": 1, "pout3": 1, "pkan4": 1},
+        {"pkan2": 1, "pkan3": 1, "pm4": 1},
+    )
+    arcs["tout4"] = ({"pout4": 1}, {"pkan4": 1})
+    return Net.build(places, arcs)
+
+
+KANBAN_RATES = {
+    "tredo1": 0.36, "tredo2": 0.42, "tredo3": 0.39, "tredo4": 0.33,
+    "tok1": 0.84, "tok2": 0.98, "tok3": 0.91, "tok4": 0.77,
+    "tback1": 0.3, "tback2": 0.3, "tback3": 0.3, "tback4": 0.3,
+    "tin1": 1.0, "tsynch123": 0.4, "tsynch234": 0.5, "tout4": 0.9,
+}  # fmt: skip
+"""Rates of Ciardo & Tilgner's model, all single server."""
+
+
+def philosophers(n: int) -> Net:
+    """n philosophers who take the left fork, then the right one: 5 n places, 5 n transitions; can deadlock."""
+    places: Weights = {}
+    arcs: dict[str, tuple[Weights, Weights]] = {}
+    for i in range(n):
+        left, right = f"fork{i}", f"fork{(i + 1) % n}"
+        places |= {f"think{i}": 1, left: 1, f"hasleft{i}": 0, f"hasright{i}": 0, f"eat{i}": 0}
+        arcs[f"left_first{i}"] = ({f"think{i}": 1, left: 1}, {f"hasleft{i}": 1})
+        arcs[f"right_first{i}"] = ({f"think{i}": 1, right: 1}, {f"hasright{i}": 1})
+        arcs[f"then_right{i}"] = ({f"hasleft{i}": 1, right: 1}, {f"eat{i}": 1})
+        arcs[f"then_left{i}"] = ({f"hasright{i}": 1, left: 1}, {f"eat{i}": 1})
+        arcs[f"done{i}"] = ({f"eat{i}": 1}, {f"think{i}": 1, left: 1, right: 1})
+    return Net.build(places, arcs)

@@ -1,0 +1,68 @@
+"""Random small nets with everything the firing rule knows, and the slowest possible state space to judge others by."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from hypothesis import strategies as st
+
+from coordinator.net import Marking, Net
+
+Weights = dict[str, int]
+
+
+@st.composite
+def nets(
+    draw: st.DrawFn,
+    *,
+    places: int = 5,
+    transitions: int = 5,
+    inhibitors: bool = True,
+    capacities: bool = True,
+    priorities: bool = True,
+    weights: int = 3,
+    tokens: int = 3,
+) -> Net:
+    """A net of at most the given size; arcs are sparse so that many draws are bounded and alive for a while."""
+    names = [f"p{i}" for i in range(draw(st.integers(1, places)))]
+    labels = [f"t{i}" for i in range(draw(st.integers(1, transitions)))]
+    arcs = st.dictionaries(st.sampled_from(names), st.integers(1, weights), max_size=3)
+    few = st.dictionaries(st.sampled_from(names), st.integers(1, tokens + 1), max_size=2)
+    initial = {p: draw(st.integers(0, tokens)) for p in names}
+    return Net.build(
+        initial,
+        {t: (draw(arcs), draw(arcs)) for t in labels},
+        inhibitors={t: draw(few) for t in labels} if inhibitors and draw(st.booleans()) else None,
+        capacity={p: draw(st.integers(n, n + 3)) for p, n in initial.items() if draw(st.booleans())}
+        if capacities and draw(st.booleans())
+        else None,
+        priority={t: draw(st.integers(0, 2)) for t in labels} if priorities and draw(st.booleans()) else None,
+    )
+
+
+@st.composite
+def state_machines(draw: st.DrawFn, *, places: int = 5, transitions: int = 8, tokens: int = 3) -> Net:
+    """A net whose transitions move one token each: always bounded, often with loops, sinks and deadlocks."""
+    names = [f"p{i}" for i in range(draw(st.integers(2, places)))]
+    moves = [
+        (draw(st.sampled_from(names)), draw(st.sampled_from(names))) for _ in range(draw(st.integers(1, transitions)))
+    ]
+    initial = dict.fromkeys(names, 0) | {names[0]: draw(st.integers(1, tokens))}
+    return Net.build(initial, {f"t{i}": ({a: 1}, {b: 1}) for i, (a, b) in enumerate(moves)})
+
+
+def brute_force(net: Net, limit: int) -> tuple[list[Marking], list[tuple[int, int, int]]] | None:
+    """Markings and edges (source, transition, target) in breadth-first order; None if there are more than `limit`."""
+    order, number, edges, queue = [net.initial], {net.initial: 0}, [], deque([0])
+    while queue:
+        i = queue.popleft()
+        for t in net.enabled(order[i]):
+            after = net.fire(order[i], t)
+            if after not in number:
+                if len(order) >= limit:
+                    return None
+                number[after] = len(order)
+                queue.append(len(order))
+                order.append(after)
+            edges.append((i, t, number[after]))
+    return order, edges
