@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from services.motion.model import ArmModel, Vector
 
-SINGULAR = 1e-7
+SINGULAR = 1e-10
 """Sine of q5 below which the axes of joints 4 and 6 count as one line."""
 
 

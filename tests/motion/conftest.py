@@ -1,0 +1,207 @@
+"""A rig for the motion room: the driver `Arm` on a bus of simulated drives around a simple arm, on a clock of its own."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+import pytest
+
+from services.comm.canbus import Frame
+from services.motion.arm import PERIOD, Arm
+from services.motion.model import nominal_arm
+from sim.drives import DriveBus, ratings
+
+TABLE = tomllib.loads(files("services.motion").joinpath("puma560.toml").read_text(encoding="utf-8"))
+
+
+class SimplePlant:
+    """Six joints that do not feel each other: inertia, gravity on joints 2 and 3, dry and viscous friction, brakes."""
+
+    GRAVITY = (0.0, 37.0, 9.0, 0.0, 0.3, 0.0)
+
+    def __init__(self, q: Sequence[float]) -> None:
+        model = nominal_arm()
+        self.q = [float(angle) for angle in q]
+        self.qd = [0.0] * 6
+        self.braked = [True] * 6
+        self.tau = [0.0] * 6
+        self._inertia = [float(joint["inertia"]) for joint in TABLE["joint"]]
+        self._viscous = (model.viscous * model.gear**2).tolist()
+        self._dry = (model.coulomb * model.gear).tolist()
+        self.factor = 1.0
+
+    def brake(self, joint: int) -> None:
+        self.braked[joint] = True
+        self.qd[joint] = 0.0
+
+    def release(self, joint: int) -> None:
+        self.braked[joint] = False
+
+    def slow_down(self, factor: float) -> None:
+        self.factor = factor
+
+    def step(self, dt: float, tau: Sequence[float]) -> None:
+        self.tau = list(tau)
+        angle = self.q[1], self.q[1] + self.q[2] + math.pi / 2
+        load = [
+            0.0,
+            self.GRAVITY[1] * math.cos(angle[0]),
+            self.GRAVITY[2] * math.cos(angle[1]),
+            0.0,
+            self.GRAVITY[4],
+            0.0,
+        ]
+        for joint in range(6):
+            if self.braked[joint]:
+                continue
+            speed, push = self.qd[joint], tau[joint] - load[joint]
+            slip = self._dry[joint]
+            drag = slip * math.tanh(speed / 0.01) + self._viscous[joint] * speed
+            after = speed + dt * (push - drag) / self._inertia[joint]
+            self.q[joint] += 0.5 * dt * (speed + after)
+            self.qd[joint] = after
+
+
+class Wire:
+    """Both directions between the arm and its drives; may be cut, and delivers by the next cycle."""
+
+    def __init__(self) -> None:
+        self.to_drives: deque[Frame] = deque()
+        self.to_arm: list[Frame] = []
+        self.cut = False
+        self.dead = False
+        self.log: list[Frame] | None = None
+
+    def send(self, frame: Frame) -> None:
+        if self.dead:
+            raise ConnectionError("the bus is dead")
+        if self.log is not None:
+            self.log.append(frame)
+        if not self.cut:
+            self.to_drives.append(frame)
+
+    def receive(self) -> Sequence[Frame]:
+        if self.dead:
+            raise ConnectionError("the bus is dead")
+        frames, self.to_arm = self.to_arm, []
+        return [] if self.cut else frames
+
+    def close(self) -> None:
+        self.dead = True
+
+
+class Stream:
+    """The receiving end of a set-point stream as the node gives it."""
+
+    def __init__(self, rig: Rig, period: float) -> None:
+        self._rig, self._period = rig, period
+        self._newest: tuple[float, ...] | None = None
+        self._came = -math.inf
+        self.count = 0
+
+    def put(self, values: Sequence[float]) -> None:
+        self._newest, self._came = tuple(values), self._rig.now
+        self.count += 1
+
+    @property
+    def age(self) -> float:
+        return self._rig.now - self._came
+
+    @property
+    def values(self) -> tuple[float, ...] | None:
+        return self._newest if self.age <= 3 * self._period + 1e-9 else None
+
+
+class Rig:
+    """Arm, bus and drives in lock step; also the arm's `Ports`."""
+
+    def __init__(
+        self,
+        start: Sequence[float] | None = None,
+        config: Mapping[str, Any] | None = None,
+        plant: Any = None,
+        drives: Any = None,
+    ) -> None:
+        self.cycle = 0
+        self.events: list[str] = []
+        self.wire = Wire()
+        self.stream_port = Stream(self, 0.02)
+        home = nominal_arm().poses["home"]
+        self.plant = plant if plant is not None else SimplePlant(start if start is not None else home)
+        self.drives = drives if drives is not None else DriveBus(self.plant, ratings(TABLE))
+        self.commanded: list[list[float]] = []
+        self.on_step: Callable[[float], None] | None = None
+        self.arm = Arm(config or {}, self)
+        self.sync = True
+
+    @property
+    def now(self) -> float:
+        return self.cycle * PERIOD
+
+    def can(self) -> Wire:
+        return self.wire
+
+    def images(self) -> Any:
+        raise AssertionError("an arm has no images")
+
+    def stream(self, name: str) -> Stream:
+        assert name == "catch_point"
+        return self.stream_port
+
+    def raise_event(self, name: str, **data: Any) -> None:
+        self.events.append(name)
+
+    def file(self, path: str) -> bytes:
+        raise AssertionError(path)
+
+    def tick(self, arm_lives: bool = True) -> None:
+        """One cycle of arm, bus, drives and plant."""
+        if arm_lives:
+            self.arm.step(self.now)
+            self.commanded.append(list(self.arm.state()["commanded"]))
+        if self.drives is not None:
+            self._laboratory()
+        self.cycle += 1
+
+    def _laboratory(self) -> None:
+        while self.wire.to_drives:
+            self.drives.receive(self.now, self.wire.to_drives.popleft())
+        for part in range(4):
+            now = self.now + part * 0.001
+            self.drives.step(now, 0.001)
+            if self.on_step is not None:
+                self.on_step(now)
+        self.wire.to_arm += self.drives.drain()
+
+    def run(self, seconds: float, until: Callable[[], bool] | None = None) -> bool:
+        """So many seconds, or until a condition holds; whether it did."""
+        for _ in range(round(seconds / PERIOD)):
+            if until is not None and until():
+                return True
+            self.tick()
+        return until is None or until()
+
+    def enable(self) -> Rig:
+        """Wait until the arm holds with its drives enabled."""
+        assert self.run(2.0, lambda: bool(self.arm.state()["enabled"])), self.arm.state()
+        return self
+
+    def feed(self, values: Iterable[float]) -> None:
+        self.stream_port.put(tuple(values))
+
+
+@pytest.fixture
+def rig() -> Rig:
+    """An arm at home, enabled."""
+    return Rig().enable()
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(20261121)

@@ -1,0 +1,124 @@
+"""Choosing catching poses: the cup is where the ball will be, in time, clear of the table, and without jumps."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from services.motion.interception import STRATEGIES, Interceptor, Plan, Prediction
+from services.motion.kinematics import Puma, branch_of
+from services.motion.limits import Guard
+from services.motion.model import nominal_arm, nominal_cell
+from services.motion.trajectory import reach_time
+
+ARM, CELL = nominal_arm(), nominal_cell()
+PUMA = Puma.of(ARM)
+GUARD = Guard(PUMA, ARM, CELL)
+HOME = ARM.poses["home"]
+INTERCEPTOR = Interceptor(PUMA, CELL, GUARD, HOME, branch_of(PUMA, np.array(HOME)))
+STILL = (0.0,) * 6
+SPEED, ACCELERATION = ARM.speed.tolist(), ARM.acceleration.tolist()
+
+
+def _exit(y: float, speed: float, heading: float, time_to_go: float = 0.5, sigma_y: float = 0.0) -> Prediction:
+    """A ball that leaves the edge at `y`, `heading` rad off the straight way."""
+    velocity = (-speed * math.cos(heading), speed * math.sin(heading), 0.0)
+    return Prediction(time_to_go, (CELL.near_edge, y, CELL.table_top + CELL.ball_radius), velocity, sigma_y, 0.0)
+
+
+def _plan(prediction: Prediction, strategy: str = "tilted", before: Plan | None = None) -> Plan | None:
+    return INTERCEPTOR.plan(STRATEGIES[strategy], prediction, HOME, STILL, SPEED, ACCELERATION, before)
+
+
+THROWS = st.builds(_exit, st.floats(-0.3, 0.3), st.floats(0.4, 2.45), st.floats(-0.2, 0.2))
+
+
+@settings(max_examples=60)
+@given(THROWS, st.sampled_from(["tilted", "upright"]))
+def test_every_nominal_ball_has_a_pose_on_its_way_that_the_arm_can_take(prediction: Prediction, strategy: str) -> None:
+    plan = _plan(prediction, strategy)
+    assert plan is not None
+    pose = PUMA.forward(np.array(plan.q))
+    mouth, axis = pose[:3, :3] @ CELL.cup.mouth + pose[:3, 3], pose[:3, :3] @ CELL.cup.axis
+    assert np.allclose(mouth, plan.point, atol=1e-9)
+    assert np.allclose(axis, plan.axis, atol=1e-9)
+    # The point lies on the ball's parabola at the time of arrival.
+    fall = plan.arrival - prediction.time_to_go
+    x, y, z = prediction.point
+    vx, vy, _ = prediction.velocity
+    assert np.allclose(plan.point, (x + vx * fall, y + vy * fall, z - 0.5 * CELL.gravity * fall**2), atol=1e-9)
+    # The cup is held as the strategy says, against the ball, and the pose is clear and on the arm's own branch.
+    assert axis[2] == pytest.approx(math.cos(STRATEGIES[strategy].tilt))
+    assert axis[0] * vx + axis[1] * vy <= 1e-12
+    assert GUARD.violation(plan.q) == ""
+    assert branch_of(PUMA, np.array(plan.q)) == branch_of(PUMA, np.array(HOME))
+    # Times are those of the trajectory generator.
+    assert plan.reach == pytest.approx(
+        float(reach_time(np.subtract(plan.q, HOME), np.zeros(6), ARM.speed, ARM.acceleration).max())
+    )
+    assert plan.slack == pytest.approx(plan.arrival - plan.reach - STRATEGIES[strategy].margin)
+
+
+@settings(max_examples=40)
+@given(THROWS, st.floats(-0.001, 0.001), st.floats(-0.005, 0.005))
+def test_small_changes_of_the_prediction_move_the_pose_a_little(prediction: Prediction, dy: float, dv: float) -> None:
+    first = _plan(prediction)
+    assert first is not None
+    x, y, z = prediction.point
+    vx, vy, vz = prediction.velocity
+    second = _plan(replace(prediction, point=(x, y + dy, z), velocity=(vx * (1 + dv), vy, vz)), before=first)
+    assert second is not None
+    assert second.candidate == first.candidate
+    assert np.abs(np.subtract(second.q, first.q)).max() < 0.05
+
+
+def test_a_late_ball_is_met_where_least_time_is_lost() -> None:
+    late = _plan(_exit(0.3, 2.4, 0.0, time_to_go=0.0))
+    assert late is not None
+    assert late.slack < 0.0
+    slow = _plan(_exit(0.3, 2.4, 0.0, time_to_go=2.0))
+    assert slow is not None
+    assert late.reach <= slow.reach + 1e-9
+
+
+def test_coarse_predictions_move_the_arm_only_a_part_of_the_way() -> None:
+    sure, unsure = _plan(_exit(0.2, 1.5, 0.0)), _plan(_exit(0.2, 1.5, 0.0, sigma_y=0.17))
+    assert sure is not None
+    assert unsure is not None
+    assert sure.point[1] == pytest.approx(0.2)
+    assert unsure.point[1] == pytest.approx(0.1)
+
+
+def test_a_ball_out_of_reach_has_no_plan() -> None:
+    assert _plan(_exit(1.2, 1.5, 0.0)) is None
+
+
+def test_a_set_point_gets_older_while_it_lies() -> None:
+    prediction = Prediction.parse([0.5, 0.62, 0.1, 0.62, -1.0, 0.0, 0.0, 0.003, 0.01], age=0.02)
+    assert prediction.time_to_go == pytest.approx(0.48)
+    assert prediction.sigma_y == 0.003
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        [0.5] * 8,
+        [0.5, 0.62, 0.1, 0.62, 1.0, 0.0, 0.0, 0.003, 0.01],
+        [0.5, 0.62, math.nan, 0.62, -1.0, 0.0, 0.0, 0.003, 0.01],
+        [0.5, 0.62, 0.1, 0.62, -1.0, 0.0, 0.0, -0.003, 0.01],
+    ],
+)
+def test_what_is_no_catch_point_is_refused(values: list[float]) -> None:
+    with pytest.raises(ValueError, match="a catch point has"):
+        Prediction.parse(values)
+
+
+def test_a_cup_along_the_flange_is_refused() -> None:
+    cup = replace(CELL.cup, axis=(0.0, 0.0, 1.0))
+    with pytest.raises(ValueError, match="axis must not lie along"):
+        Interceptor(PUMA, replace(CELL, cup=cup), GUARD, HOME, branch_of(PUMA, np.array(HOME)))

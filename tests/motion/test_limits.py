@@ -1,0 +1,108 @@
+"""The guard: whatever is commanded, forearm and cup stay clear of table, floor and pedestal."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from services.motion.kinematics import Puma
+from services.motion.limits import Guard
+from services.motion.model import nominal_arm, nominal_cell
+from services.motion.trajectory import Trajectory
+
+ARM, CELL = nominal_arm(), nominal_cell()
+PUMA = Puma.of(ARM)
+GUARD = Guard(PUMA, ARM, CELL)
+HOME = np.array(ARM.poses["home"])
+ANGLES = st.tuples(*(st.floats(low, high) for low, high in zip(ARM.lower.tolist(), ARM.upper.tolist(), strict=True)))
+NEARBY = st.tuples(*(st.floats(-0.9, 0.9) for _ in range(6)))
+
+
+@given(ANGLES)
+def test_parts_are_where_the_kinematics_puts_them(angles: tuple[float, ...]) -> None:
+    pose, at = PUMA.forward(np.array(angles)), GUARD.place(angles)
+    assert np.allclose(at.wrist, pose[:3, 3], atol=1e-12)
+    assert np.allclose(at.mouth, pose[:3, :3] @ CELL.cup.mouth + pose[:3, 3], atol=1e-12)
+    assert np.allclose(at.axis, pose[:3, :3] @ CELL.cup.axis, atol=1e-12)
+    assert np.linalg.norm(np.subtract(at.elbow, at.wrist)) == pytest.approx(PUMA.d4)
+
+
+def _surface(q: np.ndarray) -> np.ndarray:
+    """Points (n, 3) all over the outside of the cup."""
+    at = GUARD.place(q.tolist())
+    axis = np.array(at.axis)
+    first = np.cross(axis, [1.0, 0.0, 0.0] if abs(axis[0]) < 0.9 else [0.0, 1.0, 0.0])
+    first /= np.linalg.norm(first)
+    second = np.cross(axis, first)
+    turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    ring = (np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * second) * (CELL.cup.radius + CELL.cup.wall)
+    heights = np.linspace(0.0, CELL.cup.depth + CELL.cup.wall, 5)
+    return np.concatenate([np.array(at.mouth) - height * axis + ring for height in heights])
+
+
+@given(NEARBY)
+def test_a_pose_that_counts_as_clear_has_no_part_of_the_cup_in_the_table(offset: tuple[float, ...]) -> None:
+    q = HOME + offset
+    if GUARD.violation(q.tolist()):
+        return
+    points = _surface(q)
+    assert not np.any((points[:, 0] > CELL.near_edge) & (points[:, 2] < CELL.table_top))
+    assert points[:, 2].min() > 0.0
+    inside = np.hypot(points[:, 0], points[:, 1]) < ARM.body.base
+    assert not np.any(inside & (points[:, 2] < PUMA.d1))
+
+
+@settings(max_examples=12)
+@given(st.lists(st.tuples(NEARBY, st.integers(5, 90)), min_size=2, max_size=8))
+def test_no_sequence_of_set_points_passes_the_guard(steps: list[tuple[tuple[float, ...], int]]) -> None:
+    trajectory = Trajectory(HOME.tolist(), 0.004, ARM.speed.tolist(), ARM.acceleration.tolist())
+    for offset, cycles in steps:
+        trajectory.aim((HOME + offset).tolist())
+        for _ in range(cycles):
+            before = trajectory.qd
+            GUARD.advance(trajectory)
+            assert np.all(np.abs(np.subtract(trajectory.qd, before)) <= ARM.acceleration * 0.004 * (1 + 1e-9))
+            assert np.all(np.abs(trajectory.qd) <= ARM.speed * (1 + 1e-9))
+            # 5 mm of margin are left to what happens between the poses that are looked at.
+            points = _surface(np.array(trajectory.q))
+            assert not np.any((points[:, 0] > CELL.near_edge) & (points[:, 2] < CELL.table_top))
+
+
+@pytest.mark.parametrize(
+    ("pose", "says"),
+    [
+        ([200, 53.4, -216.3, 6.7, 48.6, 3.4], "joint 1 beyond its limit"),
+        ([18.7, 30.0, -190.0, 6.7, 48.6, 3.4], "cup at the table"),
+        ([-110, 220, 15, 120, -5, -140], "cup at the floor"),
+        ([-5, 195, 25, -10, 15, -95], "cup at the pedestal"),
+        ([155, 205, -145, 120, -80, 220], "forearm at the table"),
+        ([160, -45, -90, -60, 85, -130], "forearm at the floor"),
+        ([65, 220, 25, 150, -20, 20], "wrist at the pedestal"),
+    ],
+)
+def test_what_would_be_touched_is_named(pose: list[float], says: str) -> None:
+    assert GUARD.violation(np.radians(pose).tolist()) == says
+
+
+def test_a_refused_step_is_reported_and_the_arm_stops_before_the_table() -> None:
+    trajectory = Trajectory(HOME.tolist(), 0.004, ARM.speed.tolist(), ARM.acceleration.tolist())
+    into_table = HOME + np.radians([0, -30, 30, 0, 0, 0])
+    assert GUARD.violation(into_table.tolist())
+    trajectory.aim(into_table.tolist())
+    refused = [GUARD.advance(trajectory) for _ in range(200)]
+    assert refused[0] == ""
+    assert refused[-1] == "cup at the table"
+    assert GUARD.violation(trajectory.q) == ""
+    assert np.abs(trajectory.qd).max() < 0.1
+
+
+def test_an_arm_switched_on_in_a_forbidden_pose_may_leave_it() -> None:
+    stuck = np.radians([18.7, 30.0, -190.0, 6.7, 48.6, 3.4])
+    trajectory = Trajectory(stuck.tolist(), 0.004, ARM.speed.tolist(), ARM.acceleration.tolist())
+    trajectory.aim(HOME.tolist())
+    for _ in range(300):
+        GUARD.advance(trajectory)
+    assert trajectory.arrived()
+    assert GUARD.violation(trajectory.q) == ""

@@ -1,0 +1,87 @@
+"""The arm's numbers: the file is read whole, faults are named, and the accelerations can be had for the torques."""
+
+from __future__ import annotations
+
+import json
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from services.motion.kinematics import Puma
+from services.motion.limits import Guard
+from services.motion.model import ModelError, nominal_arm, nominal_cell, read_arm, read_cell
+
+ARM = files("services.motion").joinpath("puma560.toml").read_text(encoding="utf-8")
+CELL = files("services").joinpath("cell.toml").read_text(encoding="utf-8")
+
+
+def test_the_nominal_arm_is_the_published_one() -> None:
+    arm = nominal_arm()
+    assert np.degrees(arm.speed).round(6).tolist() == [82, 74, 122, 228, 241, 228]
+    assert arm.torque.tolist() == [97.6, 186.4, 89.4, 24.2, 20.1, 21.3]
+    assert arm.d[0] == pytest.approx(26.45 * 0.0254)
+    assert sum(link.mass for link in arm.links) == pytest.approx(23.45)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("limits = [-160.0, 160.0]", "limits = [-160.0]", "joint 1: limits must be 2 numbers"),
+        ("torque = 186.4", 'torque = "much"', "joint 2: torque must be a finite number"),
+        ("wrist = 0.055", "", "body: wrist must be a finite number"),
+        ("home = [18.7", "home = [180.0", "home lies outside the joint limits"),
+        ("[[link]]\nmass = 17.4", "[[spare]]\nmass = 17.4", "needs 6 [[joint]] and [[link]], has 6 and 5"),
+    ],
+)
+def test_a_bad_arm_is_refused_by_name(old: str, new: str, says: str) -> None:
+    assert old in ARM
+    with pytest.raises(ModelError, match="puma560.toml") as caught:
+        read_arm(ARM.replace(old, new, 1))
+    assert says in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("[cup]", "[mug]", r"lacks \[cup\]"),
+        ("axis = [-1.0, 0.0, 0.0]", "axis = [-1.0, 0.5, 0.0]", "unit vector"),
+        ("near_edge = 0.62", "near_edge = true", "near_edge must be a finite number"),
+    ],
+)
+def test_a_bad_cell_is_refused_by_name(old: str, new: str, says: str) -> None:
+    assert old in CELL
+    with pytest.raises(ModelError, match=says):
+        read_cell(CELL.replace(old, new, 1))
+
+
+def test_kinematics_refuses_another_arm() -> None:
+    with pytest.raises(ValueError, match="PUMA's twists"):
+        Puma.of(read_arm(ARM.replace("alpha = -90.0", "alpha = -80.0", 1)))
+
+
+def test_the_accelerations_can_be_had_for_the_torques() -> None:
+    """Inertia and gravity of the independent model, friction of ours: at home every joint may accelerate at its limit, all
+    together in any combination of signs, while it turns at its greatest speed."""
+    golden = json.loads(Path(__file__).with_name("puma560_golden.json").read_text(encoding="utf-8"))
+    arm = nominal_arm()
+    home = golden["home"]
+    assert np.allclose(home["q"], arm.poses["home"], atol=1e-9), "make the fixture again: the home pose has changed"
+    inertia, gravity = np.array(home["inertia"]), np.abs(home["gravity"])
+    needed = (
+        np.abs(inertia) @ arm.acceleration + gravity + arm.coulomb * arm.gear + arm.viscous * arm.gear**2 * arm.speed
+    )
+    assert np.all(needed <= arm.torque), (needed / arm.torque).tolist()
+
+
+def test_named_poses_are_clear_and_the_cup_is_at_the_edge() -> None:
+    arm, cell = nominal_arm(), nominal_cell()
+    guard = Guard(Puma.of(arm), arm, cell)
+    for name, pose in arm.poses.items():
+        assert guard.violation(pose) == "", name
+    home, empty = guard.place(arm.poses["home"]), guard.place(arm.poses["empty"])
+    assert abs(home.mouth[1]) < 0.005
+    assert 0.05 < cell.near_edge - home.mouth[0] < 0.20
+    assert home.mouth[2] < cell.table_top
+    assert empty.axis[2] < -0.9
