@@ -6,6 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from coordinator.check import check
+from coordinator.hmi import pnml
+from coordinator.task import Task
+from coordinator.taskfile import TaskFileError, dumps, loads
+
 
 class FormatError(ValueError):
     """A format is not known, or the text is not in it."""
@@ -20,15 +25,47 @@ class Made:
 
 
 def findings(text: str, filename: str, where: Mapping[str, str] | None) -> list[dict[str, Any]]:
-    """What keeps the task from running or should be looked at: {severity, key, text, remedy}."""
-    return []
+    """What keeps the task from running or should be looked at: {severity, key, text, remedy}; errors first.
+
+    `where` gives the node of each action that is offered; None leaves offers out.
+    """
+    try:
+        task = loads(text, filename)
+    except TaskFileError as error:
+        return [_finding("error", fault.key, fault.text, fault.remedy) for fault in error.faults]
+    report = check(task, where)
+    return [_finding(f.severity.value, f.key, f.text, f.remedy) for f in report.findings]
+
+
+def _finding(severity: str, key: str, text: str, remedy: str) -> dict[str, Any]:
+    return {"severity": severity, "key": key, "text": text, "remedy": remedy}
+
+
+def load(text: str, filename: str) -> Task:
+    """The task in a text. Raises FormatError with all faults."""
+    try:
+        return loads(text, filename)
+    except TaskFileError as error:
+        raise FormatError(str(error)) from error
 
 
 def export(text: str, filename: str, form: str) -> Made:
     """The task in another format. Raises FormatError."""
-    raise FormatError(f"no format {form!r}")
+    task = load(text, filename)
+    if form == "toml":
+        return Made(dumps(task), "application/toml")
+    if form == "pnml":
+        return Made(pnml.write(task), "application/xml")
+    raise FormatError(f"no format {form!r}: toml and pnml are known")
 
 
 def imported(form: str, text: str) -> str:
-    """A net in another format as the text of a task file. Raises FormatError."""
-    raise FormatError(f"no format {form!r}")
+    """A net in another format as the text of a task file, to go on drawing. Raises FormatError."""
+    if form == "toml":
+        return text
+    if form != "pnml":
+        raise FormatError(f"no format {form!r}: toml and pnml are known")
+    try:
+        return pnml.read(text)
+    except pnml.PnmlError as error:
+        raise FormatError(f"not a place/transition net in PNML: {error}") from error

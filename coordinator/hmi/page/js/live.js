@@ -7,7 +7,7 @@ import { attribute, fill, h, rows, seconds, text, words } from "./dom.js";
 import { icon } from "./icons.js";
 import { stateOf } from "./operator.js";
 import { Selected } from "./selected.js";
-import { sheetOf, tokensOf } from "./sheet.js";
+import { alarmed, sheetOf, tokensOf } from "./sheet.js";
 import { Timeline } from "./timeline.js";
 
 const FIRINGS_SHOWN = 25;
@@ -101,6 +101,16 @@ export class Live {
     if (name) this.view.fire(name, Boolean(firing.error));
   }
 
+  /** How an element is called on the drawing. */
+  labelOf(name) {
+    const { task } = this.link.state;
+    if (this.labelled !== task) {
+      this.labelled = task;
+      this.labels = new Map([...(task?.places ?? []), ...(task?.transitions ?? [])].map((e) => [e.name, e.label]));
+    }
+    return words(this.labels.get(name) || name);
+  }
+
   drawnAs(name) {
     return this.view.elements.has(name) ? name : null;
   }
@@ -166,37 +176,7 @@ export class Live {
       const why = failed.get(element.name);
       if (element.shape === "transition") this.view.mark(element.name, "reason", why ? "failed" : null, why ? reasonText(why) : "");
     }
-    this.alarms(task, marking);
-  }
-
-  /** Folded error branches that hold a token, by the place they begin at. */
-  alarms(task, marking) {
-    if (!task) return;
-    const red = new Set();
-    const errorPlaces = new Set(task.places.filter((p) => p.error && marking[p.name]).map((p) => p.name));
-    if (errorPlaces.size) {
-      for (const arc of task.arcs) {
-        if (arc.direction !== "in" || arc.end !== "error") continue;
-        if (this.reaches(task, arc.transition, errorPlaces)) red.add(arc.place);
-      }
-    }
-    this.view.alarm(red);
-  }
-
-  reaches(task, transition, wanted) {
-    const seen = new Set();
-    const open = [transition];
-    const error = new Set(task.places.filter((p) => p.error).map((p) => p.name));
-    while (open.length) {
-      const t = open.pop();
-      for (const arc of task.arcs) {
-        if (arc.transition !== t || arc.direction !== "out" || seen.has(arc.place) || !error.has(arc.place)) continue;
-        if (wanted.has(arc.place)) return true;
-        seen.add(arc.place);
-        for (const next of task.arcs) if (next.direction === "in" && next.place === arc.place) open.push(next.transition);
-      }
-    }
-    return false;
+    if (task) this.view.alarm(alarmed(task, marking));
   }
 
   paintFirings() {
@@ -212,7 +192,7 @@ export class Live {
     const what = firing.error ? "error" : firing.reason?.status === "failure" ? "failure" : "plain";
     return h("li", { class: `firing ${what}` },
       h("button", { type: "button", onclick: () => this.canvas.goTo(firing.transition) },
-        h("span", { class: "line" }, h("strong", {}, words(firing.transition)), h("span", { class: "number" }, seconds(firing.at))),
+        h("span", { class: "line" }, h("strong", {}, this.labelOf(firing.transition)), h("span", { class: "number" }, seconds(firing.at))),
         h("span", { class: "cause" }, firing.cause ?? ""),
         reason ? h("span", { class: "reason" }, icon(firing.error ? "error" : "warning"), h("span", {}, reason)) : null));
   }
@@ -292,6 +272,7 @@ class Dock {
     this.pages = pages;
     this.tabs = h("div", { class: "tabs", role: "tablist", "aria-label": "Details" }, Object.keys(pages).map((name) =>
       h("button", { type: "button", role: "tab", id: `tab-${name.replace(" ", "-")}`, onclick: () => this.show(name), onkeydown: (e) => this.move(e) }, name)));
+    this.tabs.append(this.timeline.choice);
     this.body = h("div", { class: "dock-body" }, Object.entries(pages).map(([name, page]) => h("div", { role: "tabpanel", "aria-labelledby": `tab-${name.replace(" ", "-")}`, hidden: true }, page)));
     this.root = h("section", { class: "dock", "aria-label": "Details" }, this.tabs, this.body);
     this.show("Timeline");
@@ -299,6 +280,7 @@ class Dock {
 
   show(name) {
     this.shown = name;
+    this.timeline.choice.hidden = name !== "Timeline";
     Object.keys(this.pages).forEach((key, i) => {
       this.tabs.children[i].setAttribute("aria-selected", String(key === name));
       this.tabs.children[i].tabIndex = key === name ? 0 : -1;

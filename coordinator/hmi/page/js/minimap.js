@@ -38,6 +38,9 @@ export class Minimap {
     if (!this.view?.box || !this.scale) return;
     const { x, y, zoom } = this.view.view;
     const { clientWidth: w, clientHeight: h } = this.view.svg;
+    const box = this.view.box;
+    const whole = box[0] * zoom + x > -60 && box[1] * zoom + y > -40 && box[2] * zoom + x < w + 60 && box[3] * zoom + y < h + 40;
+    this.svg.parentElement.hidden = whole; // nothing to find: all is in view
     const set = { x: (-x / zoom) * this.scale + this.left, y: (-y / zoom) * this.scale + this.top, width: (w / zoom) * this.scale, height: (h / zoom) * this.scale };
     for (const [key, value] of Object.entries(set)) this.frame.setAttribute(key, value.toFixed(1));
   }

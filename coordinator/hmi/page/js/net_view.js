@@ -214,7 +214,8 @@ export class NetView {
       const [place, transition] = [this.elements.get(arc.place), this.elements.get(arc.transition)];
       const hidden = this.isFolded(place) || this.isFolded(transition);
       attribute(arc.node, "display", hidden ? "none" : null);
-      if (hidden && arc.direction === "in" && !this.isFolded(place)) badges.set(place.name, place);
+      const begins = arc.end === "error" || ["action", "macro"].includes(place.kind);
+      if (hidden && begins && arc.direction === "in" && !this.isFolded(place)) badges.set(place.name, place);
     }
     for (const element of this.elements.values()) this.mark(element.name, "fold", badges.has(element.name) ? "fold" : null);
   }
@@ -339,8 +340,9 @@ export class NetView {
     const box = this.box;
     const { clientWidth: w, clientHeight: h } = this.svg;
     if (!box || !w || !h) return;
-    const zoom = Math.max(ZOOM[0], Math.min(1.5, (w - 32) / (box[2] - box[0]), (h - 32) / (box[3] - box[1])));
-    this.look((w - (box[0] + box[2]) * zoom) / 2, (h - (box[1] + box[3]) * zoom) / 2, zoom);
+    const top = 46; // the bar lies over the drawing
+    const zoom = Math.max(ZOOM[0], Math.min(1.5, (w - 24) / (box[2] - box[0]), (h - top - 12) / (box[3] - box[1])));
+    this.look((w - (box[0] + box[2]) * zoom) / 2, top + (h - top - (box[1] + box[3]) * zoom) / 2, zoom);
   }
 
   look(x, y, zoom) {

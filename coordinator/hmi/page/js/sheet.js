@@ -14,6 +14,14 @@ export function caption(transition) {
 const hintPlace = (p) => [p.name, p.primitive_task && `primitive task ${p.primitive_task}`, p.capacity && `capacity ${p.capacity}`].filter(Boolean).join("\n");
 const hintTransition = (t) => [t.name, caption(t), t.priority ? `priority ${t.priority}` : ""].filter(Boolean).join("\n");
 
+/** The net with those places marked as error branches, too, that nothing but error branches uses. */
+export function onlyErrors(net) {
+  const error = new Set(net.transitions.filter((t) => t.error).map((t) => t.name));
+  const used = new Map();
+  for (const arc of net.arcs) used.set(arc.place, (used.get(arc.place) ?? true) && error.has(arc.transition));
+  return { ...net, places: net.places.map((p) => (used.get(p.name) ? { ...p, error: true } : p)) };
+}
+
 /** The net {places, transitions, arcs} of one sheet; `inside` is the name of a macro place, "" for the whole. */
 export function sheetOf(task, inside) {
   const macros = new Set(task.places.filter((p) => p.kind === "macro").map((p) => p.name));
@@ -34,11 +42,11 @@ export function sheetOf(task, inside) {
   const places = task.places.filter(here);
   const known = new Set(places.map((p) => p.name));
   const base = (e) => (e.label ? e : { ...e, label: e.name.slice(inside ? inside.length + 1 : 0) });
-  return placed({
+  return placed(onlyErrors({
     places: places.map((p) => base({ ...p, sub: p.kind === "action" && p.primitive_task !== p.name ? words(p.primitive_task) : "", hint: hintPlace(p) })),
     transitions: transitions.map((t) => base({ ...t, sub: caption(t), hint: hintTransition(t) })),
     arcs: arcs.filter((a) => known.has(a.place)),
-  });
+  }));
 }
 
 /** Tokens of what is drawn: a macro place shows all that its inside holds. */
@@ -50,4 +58,28 @@ export function tokensOf(task, marking) {
     shown[place.name] = Object.entries(marking).reduce((sum, [name, n]) => sum + (name.startsWith(prefix) ? n : 0), 0);
   }
   return shown;
+}
+
+/** Places whose folded error branch holds a token now. */
+export function alarmed(task, marking) {
+  const inError = new Set(task.places.filter((p) => p.error).map((p) => p.name));
+  const held = new Set([...inError].filter((name) => marking[name]));
+  if (!held.size) return held;
+  const begins = task.arcs.filter((a) => a.direction === "in" && a.end === "error");
+  return new Set(begins.filter((a) => reaches(task, a.transition, inError, held)).map((a) => a.place));
+}
+
+function reaches(task, first, inError, wanted) {
+  const seen = new Set();
+  const open = [first];
+  while (open.length) {
+    const transition = open.pop();
+    for (const arc of task.arcs) {
+      if (arc.transition !== transition || arc.direction !== "out" || seen.has(arc.place) || !inError.has(arc.place)) continue;
+      if (wanted.has(arc.place)) return true;
+      seen.add(arc.place);
+      for (const next of task.arcs) if (next.direction === "in" && next.place === arc.place) open.push(next.transition);
+    }
+  }
+  return false;
 }

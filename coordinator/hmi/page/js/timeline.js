@@ -12,7 +12,8 @@ export class Timeline {
     this.canvas = h("canvas", { class: "timeline", role: "img", "aria-label": "Timeline of the runs up to now" });
     this.tip = h("div", { class: "tip", hidden: true });
     this.span = h("select", { "aria-label": "Time shown", onchange: () => this.draw() }, [["10", "10 s"], ["30", "30 s"], ["120", "2 min"], ["0", "all"]].map(([v, t]) => h("option", { value: v, selected: v === "30" }, t)));
-    this.root = h("div", { class: "timeline-box" }, h("label", { class: "span" }, "Show the last ", this.span), h("div", { class: "scroll" }, this.canvas), this.tip);
+    this.choice = h("label", { class: "span" }, "Show the last", this.span);
+    this.root = h("div", { class: "timeline-box" }, this.canvas, this.tip);
     this.chosen = chosen;
     this.bars = [];
     this.canvas.addEventListener("pointermove", (event) => this.hover(event));

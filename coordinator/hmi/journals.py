@@ -1,0 +1,155 @@
+"""Journals of mission runs as the page's history: every record with its marking, told in words."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from coordinator.engine import Engine, Fired, Report, RunRecorded, StartRun
+from coordinator.hmi.picture import picture
+from coordinator.hmi.telling import reason_of, told
+from coordinator.journal import Journal, JournalError, read_journal
+from coordinator.recording import ReplayError, Step, replay
+from coordinator.runfolder import JOURNAL, RESULT
+from coordinator.task import End, Task
+from coordinator.taskfile import TaskFileError, loads
+
+RECORDS_AT_MOST = 20_000
+RUNS_AT_MOST = 300
+
+
+class JournalHistory:
+    """The runs of one folder (`coordinator.runfolder`). Fits `coordinator.hmi.port.HistoryPort`."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    async def runs(self) -> Sequence[Mapping[str, Any]]:
+        """Every run, newest first."""
+        return await asyncio.to_thread(self._runs)
+
+    async def open(self, run: str) -> Mapping[str, Any]:
+        """One run, derived again from its journal. Raises KeyError when there is none of that name."""
+        if run not in {path.parent.name for path in self._folder.glob(f"*/{JOURNAL}")}:
+            raise KeyError(run)
+        return await asyncio.to_thread(opened, self._folder / run / JOURNAL, run)
+
+    def _runs(self) -> list[dict[str, Any]]:
+        paths = sorted(self._folder.glob(f"*/{JOURNAL}"), key=lambda p: p.stat().st_mtime, reverse=True)
+        return [_listed(path) for path in paths[:RUNS_AT_MOST]]
+
+
+def _listed(path: Path) -> dict[str, Any]:
+    """What the list of runs says of one; the journal itself is read only when it is opened."""
+    entry: dict[str, Any] = {"id": path.parent.name, "task": "", "state": "running", "started": "", "seconds": None}
+    try:
+        result = json.loads((path.parent / RESULT).read_text(encoding="utf-8"))
+        seconds = result.get("sim_s", result.get("wall_s"))
+        entry |= {"task": result.get("task", ""), "state": result.get("status", ""), "seconds": seconds}
+    except (OSError, ValueError):
+        entry["state"] = "running or interrupted"
+    entry["modified"] = path.stat().st_mtime
+    return entry
+
+
+def opened(path: Path, run: str) -> dict[str, Any]:
+    """A journal as the page's history. A journal that cannot be derived again says so in `fault`, with what could be."""
+    try:
+        journal = read_journal(path)
+        task = task_of(journal)
+    except (JournalError, TaskFileError, KeyError) as fault:
+        return {"id": run, "fault": f"{fault}", "task": None, "initial": {}, "records": []}
+    engine = Engine(task, journal.header.get("devices") or _devices(journal))
+    teller = _Teller(task)
+    records: list[dict[str, Any]] = []
+    fault_text = f"a torn tail of {journal.torn_bytes} bytes was dropped" if journal.torn_bytes else ""
+    try:
+        for step in replay(journal, engine):
+            records.append(teller.record(step))
+            if len(records) >= RECORDS_AT_MOST:
+                fault_text = f"only the first {RECORDS_AT_MOST} records are shown"
+                break
+    except (JournalError, ReplayError) as fault:
+        fault_text = str(fault)
+    header = journal.header
+    return {
+        "id": run,
+        "fault": fault_text,
+        "mode": header.get("mode", ""),
+        "seed": header.get("seed"),
+        "started": header.get("date", ""),
+        "task": picture(task),
+        "initial": dict(zip(task.net.places, task.net.initial, strict=True)),
+        "records": records,
+    }
+
+
+def task_of(journal: Journal) -> Task:
+    """The task that a journal ran, with the number of runs that it was given. Raises TaskFileError, KeyError."""
+    from coordinator.launch import with_runs
+
+    task = loads(journal.header["task"], f"{journal.path} (task)")
+    runs = journal.header.get("runs")
+    return with_runs(task, runs)[0] if runs is not None else task
+
+
+def _devices(journal: Journal) -> dict[str, str]:
+    from services.comm.directory import parse
+
+    text = journal.header.get("services")
+    if not text:
+        return {}
+    directory = parse(text, Path(journal.header.get("services_path", "services.toml")))
+    return {a.name: a.device for a in directory.actions.values() if a.device}
+
+
+class _Teller:
+    """Turns steps into records; keeps which run had which action, for the reasons of firings."""
+
+    def __init__(self, task: Task) -> None:
+        self._places = task.net.places
+        self._marking = task.net.initial
+        self._actions: dict[str, str] = {}
+        self._ends: dict[str, dict[str, Any]] = {}
+        self._errors = {t.name for t in task.flat.transitions.values() if any(i.end is End.ERROR for i in t.inputs)}
+
+    def record(self, step: Step) -> dict[str, Any]:
+        """{number, t, text, firings, marking (what changed), runs, error}."""
+        firings, notes = [], []
+        for instruction in step.instructions:
+            if isinstance(instruction, StartRun):
+                self._actions[instruction.run] = instruction.action
+                notes.append(f"{instruction.action} starts in {instruction.place}")
+            elif isinstance(instruction, RunRecorded):
+                end = reason_of(instruction.status, instruction.cause, instruction.text, instruction.executed)
+                self._ends[instruction.run] = end
+            elif isinstance(instruction, Report) and instruction.severity.value != "note":
+                notes.append(instruction.text)
+            elif isinstance(instruction, Fired):
+                firings.append(self._firing(step, instruction))
+        after = step.state.marking
+        changed = {self._places[i]: n for i, n in enumerate(after) if n != self._marking[i]}
+        self._marking = after
+        return {
+            "number": step.number,
+            "t": round(step.time, 4),
+            "text": told(step.stimulus),
+            "firings": firings,
+            "marking": changed,
+            "notes": notes,
+            "error": any(f["error"] for f in firings),
+        }
+
+    def _firing(self, step: Step, fired: Fired) -> dict[str, Any]:
+        ends = [self._ends[run] for run in fired.runs if run in self._ends]
+        worst = max(ends, key=lambda end: ("none", "success", "failure", "error").index(end["status"]), default=None)
+        return {
+            "transition": fired.transition,
+            "cause": told(step.stimulus, fired.cause),
+            "error": fired.transition in self._errors,
+            "reason": worst if worst and worst["status"] in ("failure", "error") else None,
+            "action": self._actions.get(fired.runs[0], "") if fired.runs else "",
+        }

@@ -1,0 +1,246 @@
+"""Tells a mission run as changes of the page's state: an observer of the executor, and of journals read back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from coordinator.conditions.wording import Severity
+from coordinator.engine import (
+    CancelRun,
+    Chosen,
+    EventOccurred,
+    Finished,
+    Fired,
+    HoldRun,
+    Instruction,
+    Marked,
+    Mode,
+    Paused,
+    Phase,
+    RaiseEvent,
+    ReleaseRun,
+    Report,
+    Resumed,
+    RunEnded,
+    RunHeld,
+    RunRecorded,
+    StartRun,
+    State,
+    Stimulus,
+)
+from coordinator.hmi.changes import empty_state
+from coordinator.hmi.feed import Feed
+from coordinator.hmi.picture import picture
+from coordinator.hmi.telling import plain_value, reason_of, told
+from coordinator.net import Marking
+from coordinator.task import End, Scope, Task
+from services.comm.notice import Progress
+
+_LEVEL = {Severity.NOTE: "info", Severity.WARNING: "warning", Severity.ERROR: "error"}
+
+
+class Narrator:
+    """Fills a feed. `where` gives the node of each action. Fits `coordinator.executor.Observer`.
+
+    `settled` is to be called after each stimulus that the engine has handled, with the new state: it tells what no
+    instruction says (latched events, variables, breakpoints).
+    """
+
+    def __init__(self, feed: Feed, task: Task, where: Mapping[str, str] | None = None, origin: float = 0.0) -> None:
+        self.feed = feed
+        self.task = task
+        self.origin = origin
+        self._where = where or {}
+        self._net = task.net
+        self._stimulus: Stimulus | None = None
+        self._ends: dict[str, dict[str, Any]] = {}
+        self._actions: dict[str, str] = {}
+        self._why: dict[str, str] = {}
+        self._held: dict[str, str] = {}
+        self._seen: State | None = None
+        self._error_exits = {
+            t.name for t in task.flat.transitions.values() if any(i.end is End.ERROR for i in t.inputs)
+        }
+        self._tell: Mapping[type, Callable[[float, Any], None]] = {
+            Fired: self._fired,
+            Marked: lambda t, i: self._marking(t, i.before, i.after),
+            StartRun: self._started,
+            CancelRun: lambda t, i: self._state(t, i.run, "stopping"),
+            HoldRun: lambda t, i: self._state(t, i.run, "holding"),
+            ReleaseRun: lambda t, i: self._state(t, i.run, "running"),
+            RunRecorded: self._recorded,
+            Report: self._report,
+            Paused: self._paused,
+            Resumed: lambda t, i: self.feed.emit("paused", time=t, paused=None),
+            Finished: self._finished,
+        }
+
+    def begin(self, mission: str, mode: str, **parts: Any) -> None:
+        """A mission run begins: clients get a snapshot with the task at its initial marking.
+
+        `parts` are further parts of the snapshot that outlive a mission run, such as `controls`, `nodes` and `selectors`.
+        """
+        flat = self.task.flat
+        events = {
+            name: {"scope": e.scope.value, "memory": e.memory.value, "armed": False, "count": 0, "last": None}
+            for name, e in flat.events.items()
+        }
+        state = {key: value for key, value in empty_state().items() if key != "sequence"} | {
+            "mission": {"id": mission, "state": "idle", "mode": mode, "firings": 0},
+            "task": picture(self.task),
+            "marking": dict(zip(self._net.places, self._net.initial, strict=True)),
+            "events": events,
+            "variables": {n: plain_value(v) for n, v in flat.initial_variables().items()},
+        }
+        self.feed.replace(**(state | parts))
+
+    # --- what the executor tells -----------------------------------------------------------------------------------
+
+    def stimulus(self, now: float, stimulus: Stimulus) -> None:
+        """The engine takes a stimulus in."""
+        time = now - self.origin
+        self._stimulus = stimulus
+        if isinstance(stimulus, RunEnded):
+            self._ends[stimulus.run] = reason_of(stimulus.status, stimulus.cause, stimulus.text, stimulus.executed)
+        elif isinstance(stimulus, Chosen):
+            self._why[stimulus.key] = stimulus.reason
+        elif isinstance(stimulus, (EventOccurred, RaiseEvent)):
+            known = self.feed.state["events"].get(stimulus.event)
+            if known is not None:
+                event = {**known, "count": known["count"] + 1, "last": round(time, 4)}
+                self.feed.emit("event", time=time, name=stimulus.event, event=event)
+        elif isinstance(stimulus, RunHeld):
+            self._answered(time, stimulus)
+
+    def instruction(self, now: float, instruction: Instruction) -> None:
+        """The engine gave an instruction or a record."""
+        tell = self._tell.get(type(instruction))
+        if tell is not None:
+            tell(now - self.origin, instruction)
+
+    def progress(self, now: float, run: str, notice: Progress) -> None:
+        """A run says how far it is."""
+        self.feed.emit("run_progress", time=now - self.origin, id=run, progress=round(notice.fraction, 4))
+
+    def settled(self, now: float, state: State) -> None:
+        """The engine has handled a stimulus."""
+        time, seen = now - self.origin, self._seen
+        if seen is None or seen.flags != state.flags:
+            self._flags(time, seen.flags if seen else frozenset(), state.flags)
+        if seen is None or seen.variables is not state.variables:
+            before = seen.variables if seen else {}
+            for name, value in state.variables.items():
+                if name not in before or before[name] != value:
+                    self.feed.emit("variable", time=time, name=name, value=plain_value(value))
+        if seen is None or seen.breakpoints != state.breakpoints:
+            self.feed.emit("breakpoints", time=time, breakpoints=[self._key(n) for n in sorted(state.breakpoints)])
+        if state.mode is Mode.RUNNING and self.feed.state["mission"]["state"] == "idle":
+            self.feed.emit("mission", time=time, mission={"state": "running"})
+        if state.mode is Mode.ABORTING and self.feed.state["mission"]["state"] == "running":
+            self.feed.emit("mission", time=time, mission={"state": "stopping", "reason": state.ending})
+        self._seen = state
+
+    def adopt(self, now: float, state: State) -> None:
+        """Take over a state that another process left: all of it is told."""
+        time = now - self.origin
+        self._marking(time, (-1,) * len(state.marking), state.marking)
+        for run in state.runs():
+            if run.phase in (Phase.RUNNING, Phase.STARTING, Phase.HELD):
+                primitive = self.task.primitive_task_of(run.place)
+                self._started(
+                    time, StartRun(run.id, run.place, primitive.name, run.action, run.arguments, primitive.deadline)
+                )
+        self.settled(now, state)
+
+    # --- in the words of the protocol ------------------------------------------------------------------------------
+
+    def _fired(self, time: float, fired: Fired) -> None:
+        ends = [self._ends[run] for run in fired.runs if run in self._ends]
+        worst = max(ends, key=lambda end: ("success", "failure", "error").index(end["status"]), default=None)
+        run = next((r for r in fired.runs if self._ends.get(r) is worst), fired.runs[0] if fired.runs else "")
+        action = self._actions.get(run, "")
+        firing = {
+            "number": fired.number,
+            "transition": fired.transition,
+            "at": round(time, 4),
+            "cause": told(self._stimulus, fired.cause),
+            "reason": worst if worst is not None and worst["status"] != "success" else None,
+            "error": fired.transition in self._error_exits,
+            "run": run,
+            "action": action,
+            "node": self._where.get(action, ""),
+        }
+        self.feed.emit("fired", time=time, firing=firing)
+        self._marking(time, fired.before, fired.after)
+        self.feed.emit("mission", time=time, mission={"firings": fired.number})
+
+    def _marking(self, time: float, before: Marking, after: Marking) -> None:
+        places = self._net.places
+        changed = {places[i]: n for i, n in enumerate(after) if n != before[i]}
+        if changed:
+            self.feed.emit("marking", time=time, marking=changed)
+
+    def _started(self, time: float, start: StartRun) -> None:
+        self._actions[start.run] = start.action
+        run = {
+            "id": start.run,
+            "place": start.place,
+            "primitive_task": start.primitive_task,
+            "action": start.action,
+            "node": self._where.get(start.action, ""),
+            "why": self._why.pop(start.run, "the only alternative"),
+            "started": round(time, 4),
+            "deadline": start.deadline,
+            "progress": 0.0,
+            "state": "running",
+        }
+        self.feed.emit("run_started", time=time, run=run)
+
+    def _state(self, time: float, run: str, state: str) -> None:
+        self.feed.emit("run_progress", time=time, id=run, state=state)
+
+    def _answered(self, time: float, held: RunHeld) -> None:
+        if held.answer.value == "held":
+            self._state(time, held.run, "held")
+        node = self._where.get(self._actions.get(held.run, ""), "?")
+        self._held[node] = held.answer.value
+        paused = self.feed.state["paused"]
+        if paused is not None:
+            self.feed.emit("paused", time=time, paused={**paused, "nodes": dict(self._held)})
+
+    def _recorded(self, time: float, record: RunRecorded) -> None:
+        reason = reason_of(record.status, record.cause, record.text, record.executed)
+        self._ends.setdefault(record.run, reason)
+        status = record.status.value if record.status is not None else "none"
+        self.feed.emit(
+            "run_ended", time=time, id=record.run, status=status, ended=round(time, 4), reason=reason,
+            cancelled=record.cancelled,
+        )  # fmt: skip
+
+    def _report(self, time: float, report: Report) -> None:
+        if report.severity is not Severity.NOTE:
+            self.feed.emit(
+                "notice",
+                time=time,
+                notice={"level": _LEVEL[report.severity], "text": report.text, "at": round(time, 4)},
+            )
+
+    def _paused(self, time: float, paused: Paused) -> None:
+        self._held = {}
+        self.feed.emit("paused", time=time, paused={"reason": paused.reason, "at": round(time, 4), "nodes": {}})
+
+    def _finished(self, time: float, finished: Finished) -> None:
+        aborted = self.feed.state["mission"]["state"] == "stopping"
+        state = "aborted" if aborted else finished.status.value
+        self.feed.emit("paused", time=time, paused=None)
+        self.feed.emit("mission", time=time, mission={"state": state, "reason": finished.reason})
+
+    def _flags(self, time: float, before: frozenset[str], after: frozenset[str]) -> None:
+        for name in before ^ after:
+            known = self.feed.state["events"].get(name)
+            if known is not None and self.task.flat.events[name].scope is Scope.EXTERNAL:
+                self.feed.emit("event", time=time, name=name, event={**known, "armed": name in after})
+
+    def _key(self, name: str) -> str:
+        return f"{'places' if name in self._net.place_index else 'transitions'}.{name}"

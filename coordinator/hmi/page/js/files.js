@@ -1,0 +1,186 @@
+// Task files on the server: open, save with revision, settle a conflict with both versions in view, import and export.
+
+import { fill, h } from "./dom.js";
+import { toast } from "./toast.js";
+
+async function ask(method, path, body) {
+  const response = await fetch(path, { method, headers: body ? { "Content-Type": "application/json" } : {}, body: body ? JSON.stringify(body) : undefined });
+  const isJson = response.headers.get("Content-Type")?.startsWith("application/json");
+  const value = isJson ? await response.json() : await response.text();
+  return { status: response.status, ok: response.ok, value };
+}
+
+/** The answer's value; a fault is shown and gives null. */
+async function need(method, path, body) {
+  try {
+    const answer = await ask(method, path, body);
+    if (answer.ok) return answer.value;
+    toast("error", typeof answer.value === "string" ? answer.value : "the server refused");
+  } catch {
+    toast("error", "the server cannot be reached");
+  }
+  return null;
+}
+
+export const listTasks = async () => (await need("GET", "/api/tasks")) ?? [];
+export const openTask = (name) => need("GET", `/api/tasks/${encodeURIComponent(name)}`);
+export const loadOffers = async () => (await need("GET", "/api/offers")) ?? [];
+export const listRuns = async () => (await need("GET", "/api/runs")) ?? [];
+export const openRun = (run) => need("GET", `/api/runs/${encodeURIComponent(run)}`);
+export const importNet = (form, text) => need("POST", "/api/import", { form, text });
+
+/** What the check says of a document; null when the server cannot tell. */
+export async function checkDocument(name, document, renames) {
+  try {
+    const answer = await ask("POST", "/api/check", { name, document, renames });
+    return answer.ok ? answer.value : { findings: [{ severity: "error", key: "", text: String(answer.value), remedy: "" }], text: "" };
+  } catch {
+    return null;
+  }
+}
+
+/** Save; on a conflict the person chooses. Gives what the server then has, or null. */
+export async function saveTask(model, name) {
+  const path = `/api/tasks/${encodeURIComponent(name)}`;
+  const base = name === model.name ? model.base : null;
+  let answer;
+  try {
+    answer = await ask("PUT", path, { base, document: model.data, renames: model.renames });
+  } catch {
+    toast("error", "Not saved: the server cannot be reached");
+    return null;
+  }
+  if (answer.ok) return answer.value;
+  if (answer.status !== 409) {
+    toast("error", `Not saved: ${typeof answer.value === "string" ? answer.value : "refused"}`);
+    return null;
+  }
+  const choice = await settle(name, answer.value);
+  if (choice === "theirs") return { ...answer.value.theirs, reload: true };
+  if (choice !== "yours") return null;
+  return need("PUT", path, { base: answer.value.theirs.revision, text: answer.value.yours });
+}
+
+/** Lines of two texts side by side; lines that only one has are marked. */
+export function differences(left, right) {
+  const [a, b] = [left.split("\n"), right.split("\n")];
+  const table = Array.from({ length: a.length + 1 }, () => new Uint16Array(b.length + 1));
+  for (let i = a.length - 1; i >= 0; i--) for (let j = b.length - 1; j >= 0; j--) table[i][j] = a[i] === b[j] ? table[i + 1][j + 1] + 1 : Math.max(table[i + 1][j], table[i][j + 1]);
+  const rows = [];
+  let [i, j] = [0, 0];
+  while (i < a.length || j < b.length) {
+    if (i < a.length && j < b.length && a[i] === b[j]) rows.push([a[i++], b[j++], false]);
+    else if (j >= b.length || (i < a.length && table[i + 1][j] >= table[i][j + 1])) rows.push([a[i++], null, true]);
+    else rows.push([null, b[j++], true]);
+  }
+  return rows;
+}
+
+function settle(name, { yours, theirs }) {
+  return new Promise((resolve) => {
+    const done = (choice) => {
+      dialog.close();
+      dialog.remove();
+      resolve(choice);
+    };
+    const rows = differences(theirs.text, yours);
+    const near = rows.map((_, i) => rows.slice(Math.max(0, i - 2), i + 3).some((r) => r[2]));
+    const cell = (line, changed, side) => h("td", { class: changed && line !== null ? side : "" }, line ?? "");
+    const dialog = h("dialog", { class: "conflict", "aria-label": "Conflict" },
+      h("h2", {}, `${name} was changed by somebody else since you opened it`),
+      h("p", { class: "muted" }, "Nothing has been written. These are the lines that differ."),
+      h("div", { class: "sides" }, h("table", {}, h("thead", {}, h("tr", {}, h("th", {}, "On the server"), h("th", {}, "Yours"))), h("tbody", {}, rows.filter((_, i) => near[i]).map(([l, r, changed]) => h("tr", {}, cell(l, changed, "theirs"), cell(r, changed, "yours")))))),
+      h("div", { class: "buttons" },
+        h("button", { type: "button", class: "small", onclick: () => done(null) }, "Go on editing"),
+        h("button", { type: "button", class: "small", onclick: () => done("theirs") }, "Discard mine, load theirs"),
+        h("button", { type: "button", class: "command danger", onclick: () => done("yours") }, "Replace theirs by mine")));
+    dialog.addEventListener("cancel", (event) => {
+      event.preventDefault();
+      done(null);
+    });
+    document.body.append(dialog);
+    dialog.showModal();
+  });
+}
+
+function download(name, content, type) {
+  const link = h("a", { href: URL.createObjectURL(content instanceof Blob ? content : new Blob([content], { type })), download: name });
+  document.body.append(link);
+  link.click();
+  link.remove();
+  setTimeout(() => URL.revokeObjectURL(link.href), 5000);
+}
+
+const DRAWN = ["fill", "fill-opacity", "stroke", "stroke-width", "stroke-dasharray", "stroke-linecap", "stroke-linejoin", "font-size", "font-weight", "font-style", "font-family", "text-anchor", "paint-order", "opacity"];
+
+/** The drawing of a view as an SVG text of its own: styles written out, in light colours, nothing but the net. */
+export function svgOf(view) {
+  const box = view.box ?? [0, 0, 100, 100];
+  const theme = document.documentElement.dataset.theme;
+  document.documentElement.dataset.theme = "light";
+  const clone = view.svg.cloneNode(true);
+  const [from, to] = [view.svg.querySelectorAll("*"), clone.querySelectorAll("*")];
+  from.forEach((node, i) => {
+    const style = getComputedStyle(node);
+    for (const key of DRAWN) {
+      const value = style.getPropertyValue(key);
+      if (value) to[i].setAttribute(key, value);
+    }
+    if (style.display === "none") to[i].setAttribute("display", "none");
+    for (const key of ["class", "tabindex", "role", "aria-label", "data-name", "data-arc"]) to[i].removeAttribute(key);
+  });
+  document.documentElement.dataset.theme = theme;
+  const [w, tall] = [box[2] - box[0], box[3] - box[1]];
+  for (const name of clone.getAttributeNames()) clone.removeAttribute(name);
+  clone.setAttribute("xmlns", "http://www.w3.org/2000/svg");
+  clone.setAttribute("viewBox", [box[0], box[1], w, tall].map(Math.round).join(" "));
+  clone.setAttribute("width", Math.round(w));
+  clone.setAttribute("height", Math.round(tall));
+  for (const node of clone.querySelectorAll("[display=none]")) node.remove();
+  clone.querySelector("g").removeAttribute("transform");
+  return new XMLSerializer().serializeToString(clone);
+}
+
+async function pngOf(view) {
+  const svg = svgOf(view);
+  const image = new Image();
+  image.src = `data:image/svg+xml;charset=utf-8,${encodeURIComponent(svg)}`;
+  await image.decode();
+  const canvas = h("canvas", { width: image.width * 2, height: image.height * 2 });
+  const pen = canvas.getContext("2d");
+  pen.fillStyle = "#ffffff";
+  pen.fillRect(0, 0, canvas.width, canvas.height);
+  pen.drawImage(image, 0, 0, canvas.width, canvas.height);
+  return new Promise((resolve) => canvas.toBlob(resolve, "image/png"));
+}
+
+export async function exportAs(form, model, view, text) {
+  const name = model.name || "task";
+  if (form === "svg") return download(`${name}.svg`, svgOf(view), "image/svg+xml");
+  if (form === "png") return download(`${name}.png`, await pngOf(view), "image/png");
+  if (form === "toml") return download(`${name}.toml`, text, "application/toml");
+  if (!model.name || model.dirty) return toast("warning", "Save the task first: it is exported from its file.");
+  const answer = await ask("GET", `/api/tasks/${encodeURIComponent(model.name)}/export/${form}`);
+  if (!answer.ok) return toast("error", String(answer.value));
+  return download(`${name}.${form}`, answer.value, "text/xml");
+}
+
+/** Ask for a name; null when it was cancelled. */
+export function askName(title, value) {
+  return new Promise((resolve) => {
+    const input = h("input", { value, "aria-label": "Name", pattern: "[A-Za-z0-9_][A-Za-z0-9_\\-]{0,63}", required: true });
+    const end = (result) => {
+      dialog.close();
+      dialog.remove();
+      resolve(result);
+    };
+    const form = h("form", { method: "dialog", onsubmit: (e) => { e.preventDefault(); end(input.value.trim()); } },
+      h("h2", {}, title), h("p", { class: "muted" }, "Letters, digits, _ and - ."), input,
+      h("div", { class: "buttons" }, h("button", { type: "button", class: "small", onclick: () => end(null) }, "Cancel"), h("button", { type: "submit", class: "command primary" }, "OK")));
+    const dialog = fill(h("dialog", { "aria-label": title }), form);
+    dialog.addEventListener("cancel", () => end(null));
+    document.body.append(dialog);
+    dialog.showModal();
+    input.select();
+  });
+}

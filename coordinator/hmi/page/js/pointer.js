@@ -1,0 +1,171 @@
+// The mouse in the designer: place, connect, drag with snapping, choose by a band.
+
+import { attribute, s } from "./dom.js";
+import { border } from "./geometry.js";
+import { snap } from "./designer.js";
+
+const NEAR = 7;
+const MOVED = 4;
+
+export class Pointer {
+  constructor(designer) {
+    this.designer = designer;
+    this.space = false;
+    addEventListener("keydown", (e) => e.code === "Space" && (this.space = true));
+    addEventListener("keyup", (e) => e.code === "Space" && (this.space = false));
+  }
+
+  get view() {
+    return this.designer.view;
+  }
+
+  /** True when the press was taken here; false leaves it to the view (panning). */
+  down(event) {
+    const { designer, view } = this;
+    if (event.button === 1 || this.space) return false;
+    const element = view.elementAt(event.target);
+    view.svg.focus({ preventScroll: true });
+    if (designer.tool === "arc" || designer.tool === "inhibit") return this.arcDown(event, element);
+    if (designer.tool !== "select") {
+      designer.insert(designer.tool, ...view.at(event.clientX, event.clientY));
+      return true;
+    }
+    const arc = event.target.closest?.("[data-arc]");
+    if (element) this.dragElements(event, element);
+    else if (arc) designer.choose(new Set(), designer.picture.arcs.find((a) => a.id === arc.dataset.arc));
+    else this.band(event);
+    return true;
+  }
+
+  follow(event, move, end) {
+    const { svg } = this.view;
+    svg.setPointerCapture(event.pointerId);
+    const up = (e) => {
+      svg.removeEventListener("pointermove", move);
+      svg.removeEventListener("pointerup", up);
+      svg.removeEventListener("pointercancel", up);
+      this.cancel = null;
+      end(e);
+    };
+    svg.addEventListener("pointermove", move);
+    svg.addEventListener("pointerup", up);
+    svg.addEventListener("pointercancel", up);
+  }
+
+  // ---- arcs ---------------------------------------------------------------------------------------------------------
+
+  arcDown(event, element) {
+    const { designer, view } = this;
+    if (!element) {
+      if (designer.arcFrom) this.arcTo(null, event);
+      return true;
+    }
+    if (designer.arcFrom && designer.arcFrom !== element.name) {
+      this.arcTo(element.name, event);
+      return true;
+    }
+    designer.arcFrom = element.name;
+    view.only("target", new Set([element.name]));
+    designer.tell(`From ${element.name}: choose where the arc goes.`);
+    const line = s("path", { class: "draft" });
+    view.layers.over.append(line);
+    let far = false;
+    const move = (e) => {
+      const [x, y] = view.at(e.clientX, e.clientY);
+      const [ax, ay] = border(element, x, y, 2);
+      far ||= Math.hypot(x - element.x, y - element.y) > 26;
+      attribute(line, "d", far ? `M${ax} ${ay}L${x} ${y}` : null);
+    };
+    this.follow(event, move, (e) => {
+      line.remove();
+      const under = view.elementAt(document.elementFromPoint(e.clientX, e.clientY) ?? view.svg);
+      if (under && under.name !== element.name) this.arcTo(under.name, e);
+      else if (far && !under) this.arcTo(null, e);
+    });
+    return true;
+  }
+
+  /** End an arc at an element, or at a new one of the other kind where nothing stands. */
+  arcTo(name, event) {
+    const { designer, view } = this;
+    const from = designer.arcFrom;
+    const kept = designer.tool;
+    let to = name;
+    if (!to) {
+      const [x, y] = view.at(event.clientX, event.clientY);
+      const isPlace = Boolean(designer.model.place(from));
+      to = isPlace ? designer.model.addTransition(snap(x), snap(y)) : designer.model.addPlace("action", snap(x), snap(y));
+    }
+    designer.connect(from, to);
+    designer.use(kept);
+    designer.choose(new Set([to]));
+  }
+
+  // ---- elements -----------------------------------------------------------------------------------------------------
+
+  dragElements(event, element) {
+    const { designer, view } = this;
+    if (event.shiftKey) return designer.pick(element.name, event);
+    if (!designer.selection.names.has(element.name)) designer.choose(new Set([element.name]));
+    view.focusable(element.name);
+    const [x0, y0] = view.at(event.clientX, event.clientY);
+    const moved = new Map([...designer.selection.names].map((n) => view.elements.get(n)).filter(Boolean).map((e) => [e.name, { x: e.x, y: e.y }]));
+    const others = [...view.elements.values()].filter((e) => !moved.has(e.name) && !view.isFolded(e));
+    let going = false;
+    let positions = null;
+    this.follow(event, (e) => {
+      const [x, y] = view.at(e.clientX, e.clientY);
+      if (!going && Math.hypot(x - x0, y - y0) * view.view.zoom < MOVED) return;
+      going = true;
+      positions = this.dragged(moved, element.name, x - x0, y - y0, others, e.altKey);
+      for (const [name, [nx, ny]] of Object.entries(positions)) {
+        const shown = view.elements.get(name);
+        Object.assign(shown, { x: nx, y: ny });
+        view.put(shown);
+      }
+      view.reroute(new Set(moved.keys()));
+    }, () => {
+      designer.guides([]);
+      if (positions) {
+        // the view has moved already: let the document follow, so that undo has one step
+        designer.model.move(positions);
+        view.reroute(new Set(), true);
+      } else if (!event.shiftKey) designer.choose(new Set([element.name]));
+    });
+    return null;
+  }
+
+  dragged(moved, lead, dx, dy, others, free) {
+    const { designer, view } = this;
+    const start = moved.get(lead);
+    let [x, y] = free ? [start.x + dx, start.y + dy] : [snap(start.x + dx), snap(start.y + dy)];
+    const lines = [];
+    const inX = others.find((o) => Math.abs(o.x - (start.x + dx)) < NEAR / view.view.zoom);
+    const inY = others.find((o) => Math.abs(o.y - (start.y + dy)) < NEAR / view.view.zoom);
+    if (inX && !free) lines.push([(x = inX.x), Math.min(y, inX.y) - 40, inX.x, Math.max(y, inX.y) + 40]);
+    if (inY && !free) lines.push([Math.min(x, inY.x) - 40, (y = inY.y), Math.max(x, inY.x) + 40, inY.y]);
+    designer.guides(lines);
+    const [mx, my] = [x - start.x, y - start.y];
+    return Object.fromEntries([...moved].map(([name, at]) => [name, [Math.round(at.x + mx), Math.round(at.y + my)]]));
+  }
+
+  band(event) {
+    const { designer, view } = this;
+    const [x0, y0] = view.at(event.clientX, event.clientY);
+    const kept = event.shiftKey ? designer.selection.names : new Set();
+    const box = s("rect", { class: "band", visibility: "hidden" });
+    view.layers.over.append(box);
+    designer.choose(new Set(kept));
+    this.follow(event, (e) => {
+      const [x, y] = view.at(e.clientX, e.clientY);
+      const [left, top, right, bottom] = [Math.min(x, x0), Math.min(y, y0), Math.max(x, x0), Math.max(y, y0)];
+      for (const [key, value] of Object.entries({ x: left, y: top, width: right - left, height: bottom - top, visibility: "visible" })) box.setAttribute(key, value);
+      const inside = [...view.elements.values()].filter((el) => !view.isFolded(el) && el.x >= left && el.x <= right && el.y >= top && el.y <= bottom);
+      designer.selection = { names: new Set([...kept, ...inside.map((el) => el.name)]), arc: null };
+      designer.paintSelection();
+    }, () => {
+      box.remove();
+      designer.choose(designer.selection.names);
+    });
+  }
+}

@@ -1,0 +1,115 @@
+"""Stimuli and ends of runs in words that an operator reads; pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from coordinator.engine import (
+    Abort,
+    AddTokens,
+    Begin,
+    Chosen,
+    EventOccurred,
+    ForceExit,
+    Pause,
+    RaiseEvent,
+    RemoveTokens,
+    Resume,
+    RunEnded,
+    RunHeld,
+    RunRaised,
+    RunStarted,
+    SetBreakpoints,
+    Step,
+    Stimulus,
+    StopConfirmed,
+    StopFailed,
+    TimerFired,
+    VariableChanged,
+    Verdict,
+)
+from coordinator.task import Executed, Status
+
+LONGEST_TEXT = 400
+
+
+def place_of(run: str) -> str:
+    """The place of a run's id (`place#3`)."""
+    return run.rpartition("#")[0] or run
+
+
+def told(stimulus: Stimulus | None, cause: str = "") -> str:
+    """What happened. `cause` is that of a firing: `stability` means that it followed from another."""
+    if cause == "stability":
+        return "followed at once"
+    match stimulus:
+        case RunEnded(run, status):
+            return f"{place_of(run)} ended: {status.value}"
+        case RunStarted(run):
+            return f"{place_of(run)} has begun"
+        case RunHeld(run, answer):
+            return f"{place_of(run)}: {answer.value.replace('_', ' ')}"
+        case Chosen(key, alternative, reason):
+            return f"{alternative} chosen for {place_of(key)}: {reason}" if reason else f"{alternative} chosen"
+        case Verdict(run, status):
+            return f"verdict on {place_of(run)}: {status.value}"
+        case EventOccurred(event):
+            return f"event {event}"
+        case RunRaised(run, event):
+            return f"{place_of(run)} raised {event}"
+        case RaiseEvent(event):
+            return f"event {event}, raised by the operator"
+        case TimerFired():
+            return "its time had passed"
+        case VariableChanged(name):
+            return f"{name} changed"
+        case AddTokens(place, tokens):
+            return f"operator put {tokens} into {place}"
+        case RemoveTokens(place, tokens):
+            return f"operator took {tokens} out of {place}"
+        case ForceExit():
+            return "forced by the operator"
+        case StopConfirmed(run):
+            return f"{place_of(run)} has stopped"
+        case StopFailed(run):
+            return f"{place_of(run)} could not be stopped"
+        case Pause(reason):
+            return f"paused{': ' + reason if reason else ''}"
+        case Resume():
+            return "operator let it go on"
+        case Step():
+            return "operator's step"
+        case SetBreakpoints():
+            return "breakpoints set"
+        case Abort():
+            return "aborted by the operator"
+        case Begin():
+            return "the run began"
+        case None:
+            return cause
+        case _:
+            return type(stimulus).__name__
+
+
+def reason_of(status: Status | None, cause: str, text: str, executed: Executed) -> dict[str, Any]:
+    """Why a run ended as it did: {status, code, text, executed}."""
+    return {
+        "status": status.value if status is not None else "none",
+        "code": cause,
+        "text": text[:LONGEST_TEXT],
+        "executed": executed.value,
+    }
+
+
+def plain_value(value: Any, depth: int = 4) -> Any:
+    """A variable's value for people: bytes become their size, long things are cut."""
+    if isinstance(value, bytes):
+        return f"{len(value)} bytes"
+    if isinstance(value, str):
+        return value[:LONGEST_TEXT]
+    if isinstance(value, Mapping):
+        return {str(k): plain_value(v, depth - 1) for k, v in list(value.items())[:32]} if depth else "…"
+    if isinstance(value, (list, tuple)):
+        return [plain_value(v, depth - 1) for v in value[:64]] if depth else "…"
+    return value
