@@ -14,16 +14,18 @@ import numpy as np
 from services.comm.callee import Callee, Offer
 from services.comm.canbus import Frame
 from services.comm.channels import can_body, image_body, read_can, read_images_wanted
+from services.comm.directory import Directory
 from services.comm.messages import Call, Executed, Outcome
 from services.comm.party import TICK, Envelope
-from sim.camera import PinholeCamera
+from sim.camera import Picture
 from sim.drives import DriveBus
+from sim.exposures import Exposures, camera_of
 from sim.faults import Fault, FaultPlan, read_fault
 from sim.oracle import Oracle
 from sim.puma import ArmPlant
 from sim.puma_model import Frame3
 from sim.referee import Referee
-from sim.site import CupMount, Site
+from sim.site import CupMount, Site, site_of
 from sim.thrower import Thrower
 from sim.truth import LaboratoryError, Truth
 from sim.world import World
@@ -31,50 +33,10 @@ from sim.world import World
 SERVICES = ("laboratory_prepare", "laboratory_score", "laboratory_fault")
 _NOISE, _FAULTS = 0x6361, 0x6661
 """Keep the draws of camera noise and of faults apart from other draws of the same seed."""
-_ON_TIME = 1e-9
-"""s of rounding."""
-
-
-class Exposures:
-    """When the camera exposes and when an image leaves it. One wish for images at a time."""
-
-    def __init__(self) -> None:
-        self.rate = 0.0
-        self.generation = 0
-        self._next = 0.0
-        self._sequence = 0
-        self._waiting: list[tuple[float, float, int, int, Any]] = []
-
-    def want(self, now: float, rate: float, generation: int) -> None:
-        """From now on `rate` images a second (0: none); what was exposed for an earlier wish is not sent."""
-        if rate > 0.0 and self.rate <= 0.0:
-            self._next = now
-        self.rate, self.generation = rate, generation
-        self._waiting.clear()
-
-    def due(self, now: float) -> bool:
-        """Whether an exposure has its middle at `now`; the clock of exposures goes on whether one is used or not."""
-        if self.rate <= 0.0 or now < self._next - _ON_TIME:
-            return False
-        self._next = max(self._next, now - 1.0 / self.rate) + 1.0 / self.rate
-        return True
-
-    def put(self, now: float, ready: float, pixels: Any) -> None:
-        """An image exposed at `now` leaves the camera at `ready` (s)."""
-        self._waiting.append((ready, now, self._sequence, self.generation, pixels))
-        self._sequence += 1
-
-    def take(self, until: float) -> list[tuple[float, float, int, int, Any]]:
-        """Images that leave up to `until`, as (ready, exposed, sequence, generation, pixels)."""
-        count = 0
-        while count < len(self._waiting) and self._waiting[count][0] <= until + _ON_TIME:
-            count += 1
-        gone, self._waiting = self._waiting[:count], self._waiting[count:]
-        return gone
 
 
 class Laboratory:
-    """The party of the simulated node `name`. `where` gives the party of an endpoint (`Directory.where`)."""
+    """The party of the simulated node `name`. `where` gives the party of an endpoint (`Directory.party`)."""
 
     def __init__(
         self,
@@ -105,8 +67,6 @@ class Laboratory:
         self._bus_ports: list[str] = []
         self._out: list[Envelope] = []
         self._world: World | None = None
-        self._cameras: dict[str, PinholeCamera] = {}
-        self._noise = np.random.default_rng(0)
         self._prepare(0.0, seed, truth, throws)
 
     def _prepare(self, now: float, seed: int, truth: Truth, throws: int | None) -> None:
@@ -119,7 +79,7 @@ class Laboratory:
         self.thrower = Thrower(self._site.cell, truth, seed, throws)
         self.referee = Referee(seed, truth.regime, Oracle(self._site.arm, truth, self._site.cell), now)
         self._faults = FaultPlan(np.random.default_rng((seed, _FAULTS)))
-        self._noise.bit_generator.state = np.random.default_rng((seed, _NOISE)).bit_generator.state
+        self._noise = np.random.default_rng((seed, _NOISE))
         self.bus.power(True)
         self.bus.slow_down(truth.arm_speed)
         self._moves = -1
@@ -137,7 +97,7 @@ class Laboratory:
                 self._camera_at = {envelope.source: self._where(envelope.source)}
                 self.exposures.want(now, wanted.rate, wanted.generation)
         elif envelope.channel == "call":
-            self.callee.receive(now, envelope.source, envelope.body)
+            self.callee.receive(now, self._where(envelope.source), envelope.body)
 
     def advance(self, now: float) -> None:
         """One tick: exposure of the world as it is at `now`, then on to `now` + TICK, then what leaves."""
@@ -186,12 +146,12 @@ class Laboratory:
         ready = now + self.truth.settings["camera"]["readout"] + self.truth.image_latency
         self.exposures.put(now, ready, self._picture(now))
 
-    def _picture(self, now: float) -> Any:
+    def _picture(self, now: float) -> Picture:
         ball, cup = self.world.ball, self._cup_now()
         ends, radii = self._solid_parts
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = cup.rotation(), cup.origin
-        return self._camera().render(
+        return camera_of(self._site.cell, self.truth, self._noise).render(
             None if ball is None else ball.position,
             (0.0, 0.0, 0.0) if ball is None else ball.velocity,
             ends,
@@ -200,32 +160,11 @@ class Laboratory:
             self.truth.light(now),
         )
 
-    def _camera(self) -> PinholeCamera:
-        """The camera as it hangs in this regime; each is built once, as its background is costly."""
-        true = self.truth.camera
-        key = repr((true.position.tolist(), true.rotation.tolist()))
-        if key not in self._cameras:
-            view: Mapping[str, Any] = {
-                "position": true.position,
-                "rotation": true.rotation,
-                "focal_px": true.focal_px,
-                "principal_px": true.principal_px,
-                "distortion": true.distortion,
-                "table_top": self.truth.table.top,
-                "near_edge": self.truth.table.near_edge,
-            }
-            # the camera draws its noise field when it is built: the same one whichever run comes first
-            state = self._noise.bit_generator.state
-            self._noise.bit_generator.state = np.random.default_rng(_NOISE).bit_generator.state
-            self._cameras[key] = PinholeCamera(self._site.cell, view, self._noise)
-            self._noise.bit_generator.state = state
-        return self._cameras[key]
-
     def _send_images(self, now: float) -> None:
         """An image arrives a tick after it is sent: it is sent a tick early, with the age that it has on arrival."""
         arrival = now + TICK
-        for _, exposed, sequence, generation, pixels in self.exposures.take(arrival):
-            body = image_body(pixels, arrival - exposed, sequence, generation)
+        for image in self.exposures.take(arrival):
+            body = image_body(image.pixels, arrival - image.time, image.sequence, image.generation)
             for device, party in self._camera_at.items():
                 self._out.append(Envelope(party, self.name, device, "image", body))
 
@@ -310,17 +249,16 @@ class Laboratory:
     def serve(self, now: float, service: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Answer one of `SERVICES`. Raises ValueError (LaboratoryError among them) for arguments that cannot be.
 
-        laboratory_prepare(seed, regime, throws=None): a new experiment, gives nothing;
-        laboratory_score(): see sim.referee; laboratory_fault(kind, after=0, ...): see sim.faults.
+        laboratory_prepare(seed=0, regime="A", throws=None): a new experiment, gives nothing; other parameters of the task
+        are not the laboratory's business; laboratory_score(cycles=[]): see sim.referee;
+        laboratory_fault(kind, after=0, ...): see sim.faults.
         """
         if service == "laboratory_score":
-            _only(arguments, ())
-            return self.referee.score()
+            return self.referee.score(now, arguments.get("cycles", ()))
         if service == "laboratory_fault":
             rest = {key: value for key, value in arguments.items() if key != "kind"}
             self._faults.add(read_fault(now, str(arguments.get("kind", "")), rest))
             return {}
-        _only(arguments, ("seed", "regime", "throws"))
         seed, regime, throws = arguments.get("seed", 0), arguments.get("regime", "A"), arguments.get("throws")
         if type(seed) is not int or seed < 0:
             raise ValueError(f"seed is {seed!r}: give a whole number, 0 or more")
@@ -335,7 +273,7 @@ class Laboratory:
         self.plant.close()
 
 
-def _only(arguments: Mapping[str, Any], known: Sequence[str]) -> None:
-    unknown = sorted(set(arguments) - set(known))
-    if unknown:
-        raise ValueError(f"no argument is called {unknown[0]!r}; there are {', '.join(known) or 'none'}")
+def make_laboratory(directory: Directory, name: str) -> Laboratory:
+    """The laboratory of the simulated node `name` of services.toml. Raises LaboratoryError."""
+    boot = f"{name} in lock step"
+    return Laboratory(name, site_of(directory), directory.party, boot=boot, directory=directory.hash)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from sim.oracle import Oracle, Verdict
-from sim.thrower import Throw
 from sim.world import Course, Outcome
 
 
@@ -39,9 +38,13 @@ class Referee:
         """Verdict on the newest throw."""
         return self._entries[-1].verdict if self._entries else None
 
-    def score(self) -> dict[str, Any]:
-        """All throws so far in plain data: see `_row` for a throw; counts are of throws that are over."""
-        rows = [_row(entry, self._began) for entry in self._entries]
+    def score(self, now: float, cycles: Sequence[Mapping[str, Any]] = ()) -> dict[str, Any]:
+        """All throws so far in plain data: see `_row` for a throw; counts are of throws that are over.
+
+        `cycles` are the caller's cycles: `begun_ago`, `ended_ago` (s before `now`), `status` and `cause`. A throw takes the
+        status of the cycle in which it was released, None if it was released in none.
+        """
+        rows = [_row(entry, self._began) | _status(entry.course, now, cycles) for entry in self._entries]
         over = [row for row in rows if row["outcome"] != Outcome.ROLLING]
         return {
             "seed": self._seed,
@@ -50,14 +53,22 @@ class Referee:
             "over": len(over),
             "caught": sum(row["caught"] for row in over),
             "reachable": sum(row["reachable"] for row in over),
+            "reachable_caught": sum(row["reachable"] and row["caught"] for row in over),
         }
+
+
+def _status(course: Course, now: float, cycles: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    age = now - course.released_at
+    for cycle in cycles:
+        if cycle["begun_ago"] >= age >= cycle["ended_ago"]:
+            return {"status": cycle["status"], "cause": cycle.get("cause", "")}
+    return {"status": None, "cause": ""}
 
 
 def _row(entry: _Entry, began: float) -> dict[str, Any]:
     """One throw: lengths in mm where the key says so, else SI; durations count from its release, None: it did not happen."""
     course, verdict = entry.course, entry.verdict
-    throw: Throw = course.throw
-    exit_state = course.exit_state
+    throw, exit_state = course.throw, course.exit_state
     return {
         "n": throw.n,
         "speed": throw.speed,

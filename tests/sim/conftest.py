@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +24,7 @@ from sim.puma_model import ArmModel
 from sim.site import Site, read_site
 
 REPOSITORY = Path(__file__).parents[2]
+PARTIES = {"arm": "motion", "camera": "vision"}
 CELL_FILE = REPOSITORY / "services" / "cell.toml"
 
 
@@ -51,6 +55,11 @@ class Master:
         self._ends = 0.0
         self._setup = self._setup_frames()
         self._word = 0
+        self._heard = 0
+
+    def heard(self) -> int:
+        """How many answers of drives have come so far."""
+        return self._heard
 
     @staticmethod
     def _setup_frames() -> list[list[Frame]]:
@@ -61,7 +70,9 @@ class Master:
             writes = [(t.index, t.sub, t.type.pack(t.value or 0)) for t in transfers]
             writes.append((Object.MODE, 0, Type.INTEGER8.pack(Mode.CYCLIC_SYNCHRONOUS_POSITION)))
             groups.append([sdo_write_request(node, *write) for write in writes])
-        return [*groups, [nmt(NmtCommand.START)]]
+        u32, u16 = Type.UNSIGNED32.pack, Type.UNSIGNED16.pack
+        inputs = [sdo_write_request(7, 0x1800, 1, u32(0x187)), sdo_write_request(7, 0x1800, 5, u16(100))]
+        return [*groups, inputs, [nmt(NmtCommand.START)]]
 
     def frames(self, now: float) -> list[Frame]:
         """Frames of this tick."""
@@ -69,9 +80,10 @@ class Master:
             return self._setup.pop(0)
         if self._path is not None:
             self.target = self._path(now - self._began)
-        self._word = {0: 0x06, 0x06: 0x07}.get(self._word, 0x0F)
         if all(word & 0x08 for word in self.status):
-            self._word = 0x80 if self._word != 0x80 else 0x06
+            self._word = 0x00 if self._word == 0x80 else 0x80  # a fault is reset by the bit's rising edge
+        else:
+            self._word = {0x00: 0x06, 0x80: 0x06, 0x06: 0x07}.get(self._word, 0x0F)
         pack = RECEIVED[0].type.pack, RECEIVED[1].type.pack
         frames = [
             Frame(0x200 + node, pack[0](self._word) + pack[1](to_units(self.target[node - 1]))) for node in range(1, 7)
@@ -83,6 +95,7 @@ class Master:
         for frame in frames:
             node = frame.id - 0x180
             if 1 <= node <= 6:
+                self._heard += 1
                 self.status[node - 1] = Type.UNSIGNED16.unpack(frame.data[:2])
                 self.position[node - 1] = from_units(Type.INTEGER32.unpack(frame.data[2:6]))
             elif node == 7:
@@ -125,7 +138,7 @@ class Bench:
     """A laboratory, its master, and a caller, tick by tick; envelopes take one tick each way."""
 
     def __init__(self, site: Site, **options: Any) -> None:
-        self.lab = Laboratory("laboratory", site, {"arm": "motion", "camera": "vision"}.__getitem__, **options)
+        self.lab = Laboratory("laboratory", site, lambda name: PARTIES.get(name, name), **options)
         self.home: list[float] = site.arm.poses["home"].tolist()
         self.master = Master(site.arm, self.home)
         self.tick = 0
@@ -196,7 +209,7 @@ class Bench:
     def catch_one(self) -> dict[str, Any]:
         """One whole cycle of a clairvoyant catcher: it is told where the oracle would catch. Gives the throw's row."""
         lab = self.lab
-        count = len(lab.referee.score()["throws"])
+        count = len(lab.referee.score(self.now)["throws"])
         assert self.run(lambda: lab.world.course is not None, 3.0)
         course, verdict = lab.world.course, lab.referee.last
         assert course is not None and verdict is not None
@@ -210,7 +223,7 @@ class Bench:
         self.move(turned)
         assert self.run(lambda: lab.world.course is None, 3.0), course
         self.move(self.home)
-        row: dict[str, Any] = lab.referee.score()["throws"][count]
+        row: dict[str, Any] = lab.referee.score(self.now)["throws"][count]
         return row
 
 
@@ -226,3 +239,29 @@ def bench(site: Site) -> Iterator[Callable[..., Bench]]:
     yield make
     for one in made:
         one.lab.close()
+
+
+def run_digests(seed: int, regime: str, prepared_before: bool = False) -> list[str]:
+    """Digests of the score, of all images and of the arm's end position after two throws."""
+    made = Bench(read_site(CELL_FILE), seed=77 if prepared_before else seed, regime="A" if prepared_before else regime)
+    made.call("laboratory_prepare", seed=seed, regime=regime)
+    made.enable()
+    made.want_images(10.0)
+    rows = [made.catch_one() for _ in range(2)]
+    pixels = hashlib.sha256()
+    for arrived, body in made.images:
+        pixels.update(repr((arrived, body["age"], body["sequence"])).encode())
+        pixels.update(body["pixels"].tobytes())
+    made.lab.close()
+    told = json.dumps(rows) + repr(made.master.position.tolist())
+    return [hashlib.sha256(told.encode()).hexdigest(), pixels.hexdigest()]
+
+
+@pytest.fixture
+def digests() -> Callable[..., list[str]]:
+    """`run_digests`."""
+    return run_digests
+
+
+if __name__ == "__main__":  # a fresh process, to compare with
+    print("\n".join(run_digests(int(sys.argv[1]), sys.argv[2])))

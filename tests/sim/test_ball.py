@@ -1,0 +1,108 @@
+"""The ball's closed forms against the laws that they solve."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from sim.ball import BallModel, BallState, TableMotion, fly
+
+MODEL = BallModel(radius=0.02, mass=0.0027, inertia_factor=2.0 / 3.0, gravity=9.81, friction=0.2)
+RESISTANCE = 0.006
+
+speeds = st.floats(-3.0, 3.0)
+spins = st.floats(-150.0, 150.0)
+starts = st.builds(
+    lambda vx, vy, wx, wy: BallState((2.0, 0.1, 0.62), (vx, vy, 0.0), (wx, wy, 3.0)), speeds, speeds, spins, spins
+)
+
+
+def rolling(speed: float, share: float = 1.0) -> TableMotion:
+    start = BallState((0.0, 0.0, 0.02), (speed, 0.0, 0.0), MODEL.spin_of_rolling(speed, 0.0, share))
+    return TableMotion(MODEL, start, RESISTANCE)
+
+
+def test_a_rolling_ball_loses_59_mm_per_second_each_second() -> None:
+    motion = rolling(1.5)
+    assert motion.rolls_after == 0.0
+    assert motion.state(0.0).velocity[0] - motion.state(1.0).velocity[0] == pytest.approx(0.0589, abs=5e-5)
+
+
+@pytest.mark.parametrize(("share", "settles"), [(0.0, 0.6), (0.7, 0.88), (1.0, 1.0)])
+def test_what_speed_a_sliding_ball_settles_at(share: float, settles: float) -> None:
+    """A hollow ball without spin rolls at 3/5 of its speed: angular momentum about the contact point is kept."""
+    motion = rolling(2.0, share)
+    assert motion.state(motion.rolls_after).velocity[0] == pytest.approx(settles * 2.0)
+
+
+@given(start=starts)
+def test_angular_momentum_about_the_contact_line_is_kept_while_sliding(start: BallState) -> None:
+    motion = TableMotion(MODEL, start, RESISTANCE)
+    inertia = MODEL.inertia_factor * MODEL.radius
+
+    def momentum(state: BallState) -> tuple[float, float]:
+        return state.velocity[0] + inertia * state.spin[1], state.velocity[1] - inertia * state.spin[0]
+
+    for share in (0.25, 0.5, 0.999):
+        assert momentum(motion.state(share * motion.rolls_after)) == pytest.approx(momentum(start), abs=1e-9)
+
+
+@given(start=starts)
+def test_sliding_ends_in_rolling(start: BallState) -> None:
+    motion = TableMotion(MODEL, start, RESISTANCE)
+    (vx, vy, _), (wx, wy, _) = motion.state(motion.rolls_after + 1e-12)[1:]
+    assert (vx, vy) == pytest.approx((MODEL.radius * wy, -MODEL.radius * wx), abs=1e-9)
+
+
+@given(start=starts, moment=st.floats(0.0, 1.2))
+def test_velocity_is_the_derivative_of_position(start: BallState, moment: float) -> None:
+    motion, step = TableMotion(MODEL, start, RESISTANCE), 1e-6
+    assume(all(abs(moment - edge) > 1e-5 for edge in (motion.rolls_after, motion.rests_after)))
+    before, after = motion.state(max(0.0, moment - step)), motion.state(moment + step)
+    took = moment + step - max(0.0, moment - step)
+    slope = [(b - a) / took for a, b in zip(before.position, after.position, strict=True)]
+    assert slope == pytest.approx(motion.state(moment).velocity, abs=1e-4)
+
+
+@given(start=starts, moment=st.floats(0.0, 5.0))
+def test_a_ball_never_gains_energy(start: BallState, moment: float) -> None:
+    def energy(state: BallState) -> float:
+        spin = sum(w * w for w in state.spin[:2])
+        return sum(v * v for v in state.velocity) + MODEL.inertia_factor * MODEL.radius**2 * spin
+
+    motion = TableMotion(MODEL, start, RESISTANCE)
+    assert energy(motion.state(moment + 0.01)) <= energy(motion.state(moment)) + 1e-9
+
+
+@given(start=starts, aim=st.floats(-2.0, 4.0), axis=st.integers(0, 1))
+def test_the_first_crossing_is_one_and_is_the_first(start: BallState, aim: float, axis: int) -> None:
+    motion = TableMotion(MODEL, start, RESISTANCE)
+    crossing = motion.first_crossing(axis, aim)
+    side = math.copysign(1.0, start.position[axis] - aim)
+    until = min(crossing, motion.rests_after, 30.0)
+    for k in range(50):  # strictly on the starting side before it
+        assert side * (motion.state(0.98 * until * k / 50).position[axis] - aim) > -1e-9
+    if crossing < math.inf:
+        assert motion.state(crossing).position[axis] == pytest.approx(aim, abs=1e-6)
+
+
+def test_it_comes_to_rest_and_stays() -> None:
+    motion = rolling(0.3)
+    rest = motion.state(motion.rests_after)
+    assert motion.rests_after == pytest.approx(0.3 / (RESISTANCE * 9.81))
+    assert rest.velocity == pytest.approx((0.0, 0.0, 0.0), abs=1e-12)
+    assert motion.state(motion.rests_after + 10.0).position == pytest.approx(rest.position)
+
+
+@given(speeds, speeds, st.floats(0.0, 1.0))
+def test_flight_keeps_energy(vx: float, vz: float, t: float) -> None:
+    start = BallState((0.0, 0.0, 1.0), (vx, 0.2, vz), (1.0, 2.0, 3.0))
+    now = fly(start, t, 9.81)
+
+    def energy(state: BallState) -> float:
+        return 0.5 * sum(v * v for v in state.velocity) + 9.81 * state.position[2]
+
+    assert energy(now) == pytest.approx(energy(start)) and now.spin == start.spin

@@ -1,0 +1,186 @@
+"""The contact space: impacts, friction, moving cup, nothing passes a wall."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pybullet
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sim.ball import BallModel, BallState, TableMotion, fly
+from sim.contact import ContactSpace, quaternion, twist
+from sim.puma_model import Frame3
+from sim.site import Site
+from sim.truth import Vector, rotation_from_vector
+
+UPRIGHT = Frame3((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.3, 0.0, 0.4))
+FAR = UPRIGHT._replace(origin=(-2.0, 0.0, 0.5))
+
+
+def frame(rotation: Vector, origin: Vector) -> Frame3:
+    x, y, z = (tuple(rotation[:, k].tolist()) for k in range(3))
+    return Frame3(x, y, z, tuple(origin.tolist()))
+
+
+@pytest.fixture(scope="module")
+def model(site: Site) -> BallModel:
+    return BallModel.of(site.cell["ball"], 0.2)
+
+
+@pytest.fixture(scope="module")
+def space(site: Site, model: BallModel) -> Iterator[ContactSpace]:
+    made = make_space(site, model, 0.3)
+    yield made
+    made.close()
+
+
+def make_space(site: Site, model: BallModel, restitution: float) -> ContactSpace:
+    truth = site.truth("A")
+    return ContactSpace(model, truth.table, replace(truth.cup, restitution=restitution), 0.003, truth.settings)
+
+
+def drop(space: ContactSpace, height: float, cup_speed: float) -> list[tuple[float, float]]:
+    """Approach and rebound speeds (m/s, to the cup) of a ball that falls on the bottom of a cup that rises or sinks."""
+    bottom = UPRIGHT.origin[2] - 0.07
+    space.put_ball(BallState((0.3, 0.0, bottom + 0.02 + height), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+    impacts, speed, cup = [], 0.0, UPRIGHT
+    for _ in range(400):
+        before = cup
+        cup = UPRIGHT._replace(origin=(0.3, 0.0, before.origin[2] + cup_speed * space.dt))
+        after = space.step(before, cup).velocity[2]
+        if after - speed > 0.05:
+            impacts.append((cup_speed - speed, after - cup_speed))
+        speed = after
+    return impacts
+
+
+@pytest.mark.parametrize("restitution", [0.3, 0.5])
+@pytest.mark.parametrize("cup_speed", [0.0, 0.3, -0.3])
+@pytest.mark.parametrize("height", [0.05, 0.12, 0.28])
+def test_restitution_is_what_was_asked_for(
+    site: Site, model: BallModel, restitution: float, cup_speed: float, height: float
+) -> None:
+    space = make_space(site, model, restitution)
+    impacts = [(came, went) for came, went in drop(space, height, cup_speed) if came > 0.25]
+    space.close()
+    assert impacts
+    for came, went in impacts:
+        assert restitution - 0.02 < went / came < restitution + 0.045, (came, went)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4, 0.8])
+def test_sliding_on_the_table_agrees_with_the_closed_form(
+    site: Site, space: ContactSpace, model: BallModel, share: float
+) -> None:
+    """Two independent ways to the same motion: Bullet's contact solver, and the closed form without rolling resistance."""
+    top = site.truth("A").table.top
+    start = BallState((1.6, 0.1, top + 0.02), (-1.2, 0.3, 0.0), model.spin_of_rolling(-1.2, 0.3, share))
+    motion = TableMotion(model, start, 0.0)
+    space.put_ball(start)
+    for k in range(1, 401):
+        state = space.step(FAR, FAR)
+        if k % 50 == 0:
+            exact = motion.state(k * space.dt)
+            assert state.velocity[:2] == pytest.approx(exact.velocity[:2], abs=0.015)
+            assert state.position[:2] == pytest.approx(exact.position[:2], abs=0.004)
+
+
+def test_flight_agrees_with_the_closed_form(space: ContactSpace) -> None:
+    start = BallState((0.0, 0.4, 1.5), (1.0, -0.5, 2.0), (5.0, 6.0, 7.0))
+    space.put_ball(start)
+    for _ in range(200):
+        state = space.step(FAR, FAR)
+    exact = fly(start, 0.2, 9.81)
+    assert state.velocity == pytest.approx(exact.velocity, abs=1e-9)
+    assert state.position == pytest.approx(exact.position, abs=0.0011)  # semi-implicit Euler: g t dt / 2
+
+
+def test_a_ball_rides_in_a_cup_that_turns_and_rises(space: ContactSpace) -> None:
+    """Contact velocities must be those of the moving cup: else the ball would be left behind or thrown out."""
+    space.put_ball(BallState((0.3, 0.0, 0.351), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+    cup = UPRIGHT
+    for k in range(1, 801):
+        before, t = cup, k * space.dt
+        tilt = rotation_from_vector(np.array([0.0, 0.4 * math.sin(2.0 * t), 0.0]))
+        cup = frame(tilt, np.array([0.3 + 0.1 * math.sin(3.0 * t), 0.0, 0.4 + 0.1 * (1.0 - math.cos(3.0 * t))]))
+        ball = space.step(before, cup)
+        local = cup.rotation().T @ (np.array(ball.position) - cup.origin)
+        assert math.hypot(local[0], local[1]) < 0.025 and -0.056 < local[2] < -0.03
+
+
+def side(cup: Frame3, ball: BallState) -> str:
+    """Where the ball's centre is: in the cup, over its mouth, or elsewhere."""
+    local = cup.rotation().T @ (np.array(ball.position) - cup.origin)
+    if math.hypot(local[0], local[1]) < 0.0415:
+        if -0.0715 < local[2] < 0.0:
+            return "in"
+        if local[2] >= 0.0:
+            return "over"
+    return "out"
+
+
+def shoot(space: ContactSpace, rng: np.random.Generator) -> set[tuple[str, str]]:
+    """A ball shot at a cup that moves and turns; gives the changes of place that were seen."""
+    velocity, spin = rng.uniform(-1.0, 1.0, 3), rng.uniform(-2.0, 2.0, 3)
+    turn, place = rotation_from_vector(rng.uniform(-1.2, 1.2, 3)), np.array([0.0, 0.0, 0.5])
+    middle = place - 0.035 * turn[:, 2]
+    way = rng.normal(size=3)
+    way /= np.linalg.norm(way)
+    speed = rng.uniform(0.5, 3.5)
+    aim = middle + rng.uniform(-0.03, 0.03, 3)
+    space.put_ball(BallState(tuple((aim - 0.12 * way).tolist()), tuple((speed * way).tolist()), (0.0, 0.0, 0.0)))
+    cup, seen, last = frame(turn, place), set(), ""
+    for k in range(1, 181):
+        before, t = cup, k * space.dt
+        cup = frame(rotation_from_vector(spin * t) @ turn, place + velocity * t)
+        now = side(cup, space.step(before, cup))
+        if last and now != last:
+            seen.add((last, now))
+        last = now
+    return seen
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_nothing_passes_a_wall_or_the_bottom(space: ContactSpace, seed: int) -> None:
+    """In and out of the cup only by its mouth, at up to 5 m/s to a cup that moves at 1.7 m/s and turns at 3.5 rad/s."""
+    rng = np.random.default_rng(seed)
+    changes = set().union(*(shoot(space, rng) for _ in range(4)))
+    assert not changes & {("in", "out"), ("out", "in")}
+
+
+@pytest.mark.proof
+def test_nothing_passes_a_wall_in_many_thousand_shots(space: ContactSpace) -> None:
+    rng = np.random.default_rng(2026)
+    entered = 0
+    for _ in range(5000):
+        changes = shoot(space, rng)
+        entered += ("over", "in") in changes
+        assert not changes & {("in", "out"), ("out", "in")}
+    assert entered > 500
+
+
+rotations = st.lists(st.floats(-math.pi, math.pi), min_size=3, max_size=3).map(
+    lambda v: rotation_from_vector(np.array(v))
+)
+
+
+@given(rotations)
+def test_quaternion_is_the_rotations(rotation: Vector) -> None:
+    found = quaternion(frame(rotation, np.zeros(3)))
+    assert math.hypot(*found) == pytest.approx(1.0)
+    assert np.array(pybullet.getMatrixFromQuaternion(found)).reshape(3, 3) == pytest.approx(rotation, abs=1e-6)
+
+
+@given(rotations, st.lists(st.floats(-5.0, 5.0), min_size=6, max_size=6))
+def test_twist_is_the_velocity_between_frames(rotation: Vector, rates: list[float]) -> None:
+    velocity, spin, dt = np.array(rates[:3]), np.array(rates[3:]), 0.001
+    before = frame(rotation, np.ones(3))
+    after = frame(rotation_from_vector(spin * dt) @ rotation, np.ones(3) + velocity * dt)
+    found = twist(before, after, dt)
+    assert found[0] == pytest.approx(velocity.tolist(), abs=1e-9)
+    assert found[1] == pytest.approx(spin.tolist(), abs=1e-3)

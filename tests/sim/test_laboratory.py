@@ -1,0 +1,284 @@
+"""The laboratory as a party: whole cycles, bus, camera, faults, services; and that it is deterministic to the bit."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from services.comm.channels import images_wanted
+from services.comm.messages import Executed
+from services.comm.party import TICK
+from sim.exposures import Exposures
+from sim.site import Site
+from sim.thrower import draw_throw
+from sim.world import Outcome
+
+REPOSITORY = Path(__file__).parents[2]
+Bench = Any
+"""Made by the fixture `bench` of conftest.py."""
+Benches = Callable[..., Bench]
+Digests = Callable[..., list[str]]
+
+
+@pytest.mark.parametrize("regime", ["A", "B", "C"])
+def test_the_oracles_poses_do_catch_in_the_whole_cell(bench: Benches, site: Site, regime: str) -> None:
+    """Drives, arm, cup and ball together: whoever knows the oracle's pose catches what it calls reachable."""
+    here = bench(seed=11, regime=regime)
+    here.enable()
+    here.want_images(0.001)
+    for n in range(1, 4):
+        row = here.catch_one()
+        assert row["n"] == n and row["reachable"] and row["outcome"] == "caught" and row["miss_mm"] < 3.0
+        assert row["speed"] == draw_throw(11, n, site.cell, site.truth(regime)).speed
+    assert here.master.emergencies == []
+
+
+def test_the_digital_input_shows_the_ball(bench: Benches) -> None:
+    here = bench(seed=11)
+    here.enable()
+    here.want_images(0.001)
+    assert here.run(lambda: here.lab.world.course is not None, 3.0)
+    here.master.move(here.now, here.lab.referee.last.pose.tolist())
+    assert not here.master.inputs & 0x01 and here.master.inputs & 0x02
+    assert here.run(lambda: here.lab.world.barrier, 6.0)
+    assert here.run(lambda: bool(here.master.inputs & 0x01), 3 * TICK)
+
+
+# Thrower
+
+
+def test_nothing_is_thrown_without_images_or_away_from_home(bench: Benches) -> None:
+    here = bench(seed=1)
+    here.enable()
+    here.wait(2.0)
+    assert here.lab.world.course is None
+    here.move([angle + 0.1 for angle in here.home])
+    here.want_images(0.001)
+    here.wait(2.0)
+    assert here.lab.world.course is None
+    here.move(here.home)
+    assert here.run(lambda: here.lab.world.course is not None, 2.0)
+
+
+# Camera
+
+
+def test_images_come_at_their_rate_with_their_true_age(bench: Benches) -> None:
+    here = bench(seed=1)
+    here.want_images(50.0)
+    here.wait(0.4)
+    arrivals = [now for now, _ in here.images]
+    assert np.diff(arrivals) == pytest.approx(0.02)
+    exposed = [now - body["age"] for now, body in here.images]
+    assert np.diff(exposed) == pytest.approx(0.02) and [b["sequence"] for _, b in here.images] == list(
+        range(len(exposed))
+    )
+    assert {round(body["age"], 6) for _, body in here.images} == {0.008}
+    pixels = here.images[0][1]["pixels"]
+    assert pixels.shape == (480, 640) and pixels.dtype == np.uint8 and pixels.std() > 10.0
+
+
+@pytest.mark.parametrize(("regime", "age"), [("A+latency200", 0.208), ("A+latency400", 0.408)])
+def test_latency_delays_images_and_they_say_so(bench: Benches, regime: str, age: float) -> None:
+    here = bench(seed=1, regime=regime)
+    here.want_images(25.0)
+    here.wait(0.6)
+    assert here.images[0][0] == pytest.approx(age, abs=TICK + 1e-9)
+    assert [body["age"] for _, body in here.images] == pytest.approx([age] * len(here.images))
+
+
+def test_a_new_wish_drops_what_was_exposed_for_the_old_one(bench: Benches) -> None:
+    here = bench(seed=1, regime="A+latency200")
+    here.want_images(50.0)
+    here.wait(0.1)
+    here.post("control", "camera", images_wanted(50.0, 2))
+    here.wait(0.3)
+    assert {body["generation"] for _, body in here.images} == {2}
+    here.post("control", "camera", images_wanted(0.0, 3))
+    here.wait(0.05)
+    count = len(here.images)
+    here.wait(0.3)
+    assert len(here.images) == count
+
+
+def test_exposures_keep_their_clock_whatever_rate() -> None:
+    exposures = Exposures()
+    exposures.want(0.0, 30.0, 1)
+    taken = [k * TICK for k in range(2500) if exposures.due(k * TICK)]
+    assert len(taken) == pytest.approx(300, abs=1)
+    assert max(abs(t - n / 30.0) for n, t in enumerate(taken)) < TICK + 1e-9
+
+
+# Faults
+
+
+def fault(here: Bench, kind: str, **arguments: object) -> None:
+    assert here.call("laboratory_fault", kind=kind, **arguments).status == "success"
+
+
+@pytest.mark.parametrize(("kind", "share"), [("dead_camera", None), ("drop_images", 1.0), ("drop_images", 0.5)])
+def test_images_fail_for_a_while(bench: Benches, kind: str, share: float | None) -> None:
+    here = bench(seed=1)
+    here.want_images(50.0)
+    here.wait(0.1)
+    count = len(here.images)
+    fault(here, kind, duration=0.4, **({} if share is None else {"share": share}))
+    here.wait(0.4)
+    came = len(here.images) - count
+    assert came <= 2 if share != 0.5 else 3 <= came <= 17
+    here.wait(0.2)
+    assert len(here.images) - count - came >= 9
+
+
+def test_a_drive_fault_stops_its_drive_and_is_reported(bench: Benches) -> None:
+    here = bench(seed=1)
+    here.enable()
+    fault(here, "drive_fault", joint=3, after=0.1)
+    assert here.run(lambda: bool(here.master.status[2] & 0x08), 0.3)
+    assert here.run(lambda: len(here.master.emergencies) == 1, 0.1)
+    assert here.lab.plant.braked[2] and not here.lab.plant.braked[0]
+
+
+def test_bus_off_silences_the_bus_both_ways(bench: Benches) -> None:
+    here = bench(seed=1)
+    here.enable()
+    here.want_images(0.001)
+    fault(here, "bus_off", duration=0.1)
+    seen = here.master.position.copy()
+    here.master.move(here.now, [angle + 0.05 for angle in here.home])
+    here.wait(0.09)
+    assert (here.master.position == seen).all()
+    assert abs(here.lab.plant.q[0] - here.home[0]) < 0.01  # the set points did not come through
+
+
+def test_lost_frames_are_lost_at_the_share_asked_for(bench: Benches) -> None:
+    here = bench(seed=1)
+    here.enable()
+    fault(here, "can_errors", share=0.3)
+    here.wait(0.02)
+    heard = here.master.heard
+    begun = heard()
+    here.wait(4.0)
+    # an answer needs the SYNC (0.7) and its own way back (0.7)
+    assert (heard() - begun) / (1000 * 6) == pytest.approx(0.49, abs=0.04)
+    fault(here, "clear")
+    here.wait(0.1)
+    begun = heard()
+    here.wait(0.2)
+    assert heard() - begun == 50 * 6
+
+
+def test_a_slow_arm_is_slow(bench: Benches) -> None:
+    here = bench(seed=1)
+    here.enable()
+    fault(here, "slow_arm", factor=0.3)
+    here.wait(0.02)
+    here.master.move(here.now, [here.home[0] + 1.0, *here.home[1:]])
+    fastest = 0.0
+    for _ in range(200):
+        here.step()
+        fastest = max(fastest, abs(here.lab.plant.qd[0]))
+    assert 0.1 < fastest < 0.36 * here.lab.plant.model.speed[0]
+
+
+def test_arm_power_falls_and_comes_back(bench: Benches) -> None:
+    here = bench(seed=1)
+    here.enable()
+    fault(here, "arm_power", duration=0.2)
+    here.wait(0.1)
+    assert all(here.lab.plant.braked) and not here.master.inputs & 0x02
+    here.wait(0.2)
+    assert here.master.inputs & 0x02
+    assert here.run(lambda: here.master.enabled, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"kind": "fire"}, "no fault is called 'fire'"),
+        ({"kind": "drive_fault"}, "joint is missing"),
+        ({"kind": "drive_fault", "joint": 7}, "from 1 to 6"),
+        ({"kind": "drive_fault", "joint": 1.5}, "whole number"),
+        ({"kind": "slow_arm", "factor": 0.0}, "from 0.05 to 1"),
+        ({"kind": "dead_camera", "joint": 1}, "takes no 'joint'"),
+        ({"kind": "drop_images", "share": "half"}, "share is 'half'"),
+        ({}, "no fault is called ''"),
+    ],
+)
+def test_a_fault_that_cannot_be_is_refused(bench: Benches, arguments: dict[str, object], says: str) -> None:
+    outcome = bench().call("laboratory_fault", **arguments)
+    assert outcome.status == "error" and outcome.cause == "bad_arguments" and says in outcome.text
+    assert outcome.executed is Executed.NO
+
+
+# Services
+
+
+def test_prepare_begins_a_new_experiment(bench: Benches) -> None:
+    here = bench(seed=1, regime="A")
+    here.enable()
+    here.want_images(0.001)
+    assert here.run(lambda: here.lab.world.course is not None, 3.0)
+    answer = here.call("laboratory_prepare", seed=5, regime="C+dim", throws=1, runs=4)
+    assert answer.status == "success"
+    assert here.lab.world.course is None and here.call("laboratory_score").values["throws"] == []
+    row = here.catch_one()
+    assert 2.0 <= row["speed"] <= 2.5
+    here.wait(2.0)
+    assert here.lab.world.course is None  # one throw was asked for
+    score = here.call("laboratory_score").values
+    assert (score["seed"], score["regime"], score["over"], score["caught"]) == (5, "C+dim", 1, 1)
+
+
+def test_a_throw_takes_the_status_of_its_cycle(bench: Benches) -> None:
+    here = bench(seed=1)
+    here.enable()
+    here.want_images(0.001)
+    here.catch_one()
+    released = here.lab.referee.score(here.now)["throws"][0]["released_after"]
+    ago = here.now - released
+    cycles = [
+        {"n": 1, "begun_ago": ago + 5.0, "ended_ago": ago + 1.0, "status": "failure", "cause": "x"},
+        {"n": 2, "begun_ago": ago + 1.0, "ended_ago": ago - 1.0, "status": "success", "cause": ""},
+    ]
+    assert here.call("laboratory_score", cycles=cycles).values["throws"][0]["status"] == "success"
+    assert here.call("laboratory_score").values["throws"][0]["status"] is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"regime": "Z"}, "must begin with"),
+        ({"seed": -1}, "seed is -1"),
+        ({"seed": "one"}, "seed is 'one'"),
+        ({"throws": 1.5}, "throws is 1.5"),
+    ],
+)
+def test_a_preparation_that_cannot_be_is_refused(bench: Benches, arguments: dict[str, object], says: str) -> None:
+    outcome = bench().call("laboratory_prepare", **arguments)
+    assert outcome.status == "error" and says in outcome.text
+
+
+# Determinism
+
+
+def test_the_same_seed_gives_the_same_bits_here_and_in_a_fresh_process(digests: Digests) -> None:
+    """Frames, pixels and score; also when the laboratory had been prepared for another run before."""
+    here = digests(3, "B+drift")
+    program = [sys.executable, str(Path(__file__).with_name("conftest.py")), "3", "B+drift"]
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "PYTHONHASHSEED": "4711"}
+    there = subprocess.run(program, capture_output=True, text=True, check=True, timeout=120, env=environment)
+    assert there.stdout.split()[-3:] == here
+    assert digests(3, "B+drift", prepared_before=True) == here
+    assert digests(4, "B+drift") != here
+
+
+def test_outcomes_are_plain_words() -> None:
+    assert {str(outcome) for outcome in Outcome} == {"rolling", "caught", "missed", "dropped"}

@@ -1,0 +1,213 @@
+"""The arm against published values, against PyBullet, against mechanics that PyBullet has no part in."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sim.puma import ArmPlant, RigidBody
+from sim.puma_model import ArmModel, Link
+from sim.puma_urdf import urdf
+from sim.truth import Vector
+
+GRAVITY = 9.81
+ANGLES = st.lists(st.floats(-1.0, 1.0), min_size=6, max_size=6)
+"""Joint angles as shares of the way from the middle of the limits to their ends."""
+
+
+@pytest.fixture(scope="module")
+def body(arm: ArmModel) -> RigidBody:
+    return RigidBody(arm, GRAVITY)
+
+
+def angles(arm: ArmModel, shares: list[float]) -> list[float]:
+    middle, half = (arm.lower + arm.upper) / 2, (arm.upper - arm.lower) / 2
+    return (middle + half * np.array(shares)).tolist()  # type: ignore[no-any-return]
+
+
+def potential_energy(arm: ArmModel, q: list[float]) -> float:
+    """From masses and heights alone (J)."""
+    frames = arm.frames(q)
+    return sum(
+        GRAVITY * link.mass * frame.point(link.centre)[2] for link, frame in zip(arm.links, frames[1:], strict=True)
+    )
+
+
+def without_friction(arm: ArmModel) -> ArmModel:
+    return replace(arm, viscous=np.zeros(6), coulomb=np.zeros(6))
+
+
+# The Robotics Toolbox's documentation prints these for its Puma560 (kinematics without the pedestal).
+QZ = [0.0] * 6
+QN = [0.0, math.pi / 4, math.pi, 0.0, math.pi / 4, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("q", "torques"), [(QZ, [0, 37.4837, 0.2489, 0, 0, 0]), (QN, [0, 31.6399, 6.0351, 0, 0.0283, 0])]
+)
+def test_gravity_is_the_published_one(body: RigidBody, q: list[float], torques: list[float]) -> None:
+    assert body.bias(q, [0.0] * 6) == pytest.approx(torques, abs=1e-4)
+
+
+def test_mass_matrix_is_the_published_one(arm: ArmModel, body: RigidBody) -> None:
+    published = [
+        [3.6594, -0.4044, 0.1006, -0.0025, 0.0, 0.0],
+        [-0.4044, 4.4137, 0.3509, 0.0, 0.0024, 0.0],
+        [0.1006, 0.3509, 0.9378, 0.0, 0.0015, 0.0],
+        [-0.0025, 0.0, 0.0, 0.1925, 0.0, 0.0],
+        [0.0, 0.0024, 0.0015, 0.0, 0.1713, 0.0],
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.1941],
+    ]
+    mass = body.mass_matrix(QN) + np.diag(arm.rotor)
+    # link 3's published tensor is no real body's; mending it moves the inertia about joint 1 by 0.004 kg m^2
+    assert mass == pytest.approx(np.array(published), abs=4.1e-3)
+    assert mass[1:, 1:] == pytest.approx(np.array(published)[1:, 1:], abs=1e-3)
+
+
+def test_zero_pose_is_the_published_one(arm: ArmModel) -> None:
+    assert arm.flange_frame(QZ).origin == pytest.approx((0.4521, -0.15005, 0.4318 + 0.67183))
+
+
+@settings(max_examples=60, deadline=None)
+@given(shares=ANGLES)
+def test_forward_kinematics_agrees_with_bullet(arm: ArmModel, body: RigidBody, shares: list[float]) -> None:
+    q = angles(arm, shares)
+    flange = arm.flange_frame(q)
+    origin, rotation = body.link_frame(q, 5)  # frame 6 coincides with its URDF link: d6, a6 and alpha6 are zero
+    assert flange.origin == pytest.approx(origin, abs=1e-6)
+    assert flange.rotation() == pytest.approx(rotation, abs=2e-6)
+
+
+@settings(max_examples=40, deadline=None)
+@given(shares=ANGLES)
+def test_gravity_is_the_gradient_of_the_potential_energy(arm: ArmModel, body: RigidBody, shares: list[float]) -> None:
+    q, step = angles(arm, shares), 1e-5
+    gradient = []
+    for joint in range(6):
+        up, down = list(q), list(q)
+        up[joint] += step
+        down[joint] -= step
+        gradient.append((potential_energy(arm, up) - potential_energy(arm, down)) / (2 * step))
+    assert body.bias(q, [0.0] * 6) == pytest.approx(gradient, abs=1e-6)
+
+
+@settings(max_examples=40, deadline=None)
+@given(shares=ANGLES)
+def test_mass_matrix_is_symmetric_and_positive(arm: ArmModel, body: RigidBody, shares: list[float]) -> None:
+    mass = body.mass_matrix(angles(arm, shares))
+    assert mass == pytest.approx(mass.T, abs=1e-12)
+    assert np.linalg.eigvalsh(mass + np.diag(arm.rotor)).min() > 0.1
+
+
+def test_every_published_tensor_reaches_bullet(arm: ArmModel, body: RigidBody) -> None:
+    """Bullet silently zeroes an impossible tensor: moments of inertia about each joint must count."""
+    links = tuple(Link(n.mass, n.centre, (2 * n.inertia[0], 2 * n.inertia[1], 2 * n.inertia[2])) for n in arm.links)
+    difference = RigidBody(replace(arm, links=links), GRAVITY).mass_matrix(QN) - body.mass_matrix(QN)
+    assert difference[0, 0] > 0.35  # link 1's own 0.35 alone
+    assert difference[2, 2] == pytest.approx(arm.links[2].inertia[1] + 1.3e-3 + 0.4e-3 + 0.15e-3, abs=6e-4)
+
+
+def test_urdf_names_all_six_joints(arm: ArmModel) -> None:
+    text = urdf(arm)
+    assert [text.count(f'name="joint{n}"') for n in range(1, 7)] == [1] * 6
+
+
+def released(arm: ArmModel, q: list[float], joints: range = range(6)) -> ArmPlant:
+    plant = ArmPlant(arm, GRAVITY, q)
+    for joint in joints:
+        plant.release(joint)
+    return plant
+
+
+def test_energy_is_kept_without_friction(arm: ArmModel) -> None:
+    free = without_friction(arm)
+    body, start = RigidBody(free, GRAVITY), [0.3, 0.9, -1.6, 0.4, 0.8, 0.0]
+    plant = released(free, start)
+
+    def energy() -> float:
+        qd = np.array(plant.qd)
+        kinetic = 0.5 * qd @ (body.mass_matrix(plant.q) + np.diag(free.rotor)) @ qd
+        return float(kinetic) + potential_energy(free, plant.q)
+
+    before, drop = energy(), potential_energy(free, plant.q)
+    for _ in range(450):
+        plant.step(0.001)
+    drop -= potential_energy(free, plant.q)
+    assert drop > 10.0  # J: it really fell
+    assert energy() == pytest.approx(before, abs=0.01 * drop)
+
+
+def test_brakes_hold_and_stop_the_arm(arm: ArmModel) -> None:
+    home = arm.poses["home"].tolist()
+    plant = ArmPlant(arm, GRAVITY, home)
+    for _ in range(200):
+        plant.step(0.001)
+    assert plant.q == home and plant.moves == 0
+    plant.release(1)
+    for _ in range(300):
+        plant.step(0.001)
+    fallen = plant.q[1]
+    assert fallen < home[1] - 0.1 and plant.qd[1] < -0.5
+    plant.brake(1)
+    for _ in range(100):
+        plant.step(0.001)
+    assert plant.still and fallen - plant.q[1] < 0.05
+
+
+@pytest.mark.parametrize(("torque", "moves"), [(20.0, False), (-20.0, False), (32.0, True), (-32.0, True)])
+def test_dry_friction_holds_up_to_its_limit(arm: ArmModel, torque: float, moves: bool) -> None:
+    """Joint 1 feels no gravity; its dry friction is 62.6 x 0.415 = 26 N m."""
+    plant = released(arm, arm.poses["home"].tolist(), range(1))
+    for _ in range(100):
+        plant.step(0.001, [torque, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert (plant.moves > 0) is moves
+    assert bool(abs(plant.q[0] - arm.poses["home"][0]) > 1e-3) is moves
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.5, 0.3])
+def test_speed_has_a_limit(arm: ArmModel, factor: float) -> None:
+    plant = released(arm, arm.poses["home"].tolist(), range(1))
+    plant.slow_down(factor)
+    fastest = 0.0
+    for _ in range(800):
+        plant.step(0.001, [1e6, 0.0, 0.0, 0.0, 0.0, 0.0])
+        fastest = max(fastest, plant.qd[0])
+    assert 0.9 * factor < fastest / arm.speed[0] < 1.15 * factor
+
+
+def test_torque_has_a_limit(arm: ArmModel) -> None:
+    home = arm.poses["home"].tolist()
+    at_limit, beyond = released(arm, home, range(1)), released(arm, home, range(1))
+    for _ in range(30):
+        at_limit.step(0.001, [arm.torque[0], 0.0, 0.0, 0.0, 0.0, 0.0])
+        beyond.step(0.001, [10 * arm.torque[0], 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert at_limit.q == beyond.q
+
+
+def test_hard_stops_end_the_motion(arm: ArmModel) -> None:
+    plant = released(arm, [arm.upper[0] - 0.05, *arm.poses["home"][1:].tolist()], range(1))
+    for _ in range(600):
+        plant.step(0.001, [90.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert plant.q[0] == pytest.approx(arm.upper[0]) and plant.qd[0] == 0.0
+
+
+@pytest.mark.parametrize("factor", [0.0, -1.0, 1.5])
+def test_a_bad_speed_factor_is_refused(arm: ArmModel, factor: float) -> None:
+    plant = ArmPlant(arm, GRAVITY, QZ)
+    with pytest.raises(ValueError, match="speed factor"):
+        plant.slow_down(factor)
+
+
+def test_step_size_hardly_matters(arm: ArmModel) -> None:
+    def swing(dt: float) -> Vector:
+        plant = released(arm, arm.poses["home"].tolist())
+        for _ in range(round(0.3 / dt)):
+            plant.step(dt, [60.0, 40.0, -20.0, 8.0, 6.0, 8.0])
+        return np.array(plant.q)
+
+    assert swing(0.001) == pytest.approx(swing(0.00025), abs=4e-3)

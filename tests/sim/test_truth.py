@@ -1,0 +1,107 @@
+"""Regime names, disturbances, and errors that stay with the installation."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim.puma_model import read_arm
+from sim.site import Site, read_site
+from sim.truth import LABORATORY_FILE, LaboratoryError, Truth, read_toml, read_truth
+
+SETTINGS = read_toml(LABORATORY_FILE)
+
+
+def changed(one: Truth, other: Truth) -> set[str]:
+    """Names of the fields in which two truths differ."""
+    names = {f.name for f in fields(Truth)} - {"regime", "settings", "camera", "cup", "table"}
+    parts = {name: (getattr(one, name), getattr(other, name)) for name in names}
+    for part in ("camera", "cup", "table"):
+        a, b = getattr(one, part), getattr(other, part)
+        parts |= {f"{part}.{f.name}": (getattr(a, f.name), getattr(b, f.name)) for f in fields(a)}
+    return {name for name, (a, b) in parts.items() if not np.array_equal(a, b)}
+
+
+@pytest.mark.parametrize(
+    ("name", "differs"),
+    [
+        ("A+drift", {"light_drift"}),
+        ("A+dim", {"light_level"}),
+        ("A+miscalibrated", {"camera.position", "camera.rotation", "cup.mouth"}),
+        ("A+latency200", {"image_latency"}),
+        ("A,latency400", {"image_latency"}),
+        ("A + arm50", {"arm_speed"}),
+        ("A+arm30", {"arm_speed"}),
+        ("A+bouncy", {"cup.restitution"}),
+        ("A+dim+arm50+bouncy", {"light_level", "arm_speed", "cup.restitution"}),
+        ("C", {"speed"}),
+    ],
+)
+def test_a_disturbance_changes_what_it_names_and_nothing_else(site: Site, name: str, differs: set[str]) -> None:
+    assert changed(site.truth("A"), site.truth(name)) == differs
+
+
+def test_every_disturbance_of_the_file_is_tried_here(site: Site) -> None:
+    for name in SETTINGS["disturbances"]:
+        assert changed(site.truth("B"), site.truth(f"B+{name}")), name
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("D", "must begin with one of A, B, C"),
+        ("dim", "must begin with"),
+        ("A+fog", "no disturbance 'fog'"),
+        ("A+latency200+latency400", "latency200 and latency400 both set image_latency"),
+    ],
+)
+def test_a_name_that_means_nothing_is_refused(site: Site, name: str, says: str) -> None:
+    with pytest.raises(LaboratoryError, match=says.replace("+", r"\+")):
+        site.truth(name)
+
+
+def test_the_true_cell_is_near_the_nominal_one_but_not_it(site: Site) -> None:
+    truth, cell = site.truth("A"), site.cell
+    assert 1e-4 < np.linalg.norm(truth.camera.position - cell["camera"]["position"]) < 0.03
+    assert 1e-4 < np.linalg.norm(truth.cup.mouth - cell["cup"]["mouth"]) < 0.005
+    assert 0.0 < np.abs(truth.joint_zero).max() < 2e-3
+    assert truth.camera.rotation @ truth.camera.rotation.T == pytest.approx(np.eye(3))
+    assert truth.camera.rotation[2] @ [0.0, 0.0, -1.0] > 0.999
+
+
+def test_light_drifts_around_its_level(site: Site) -> None:
+    truth = site.truth("A+drift")
+    levels = [truth.light(0.1 * k) for k in range(80)]
+    assert max(levels) == pytest.approx(1.35, abs=0.01) and min(levels) == pytest.approx(0.65, abs=0.01)
+    assert {site.truth("A").light(t) for t in (0.0, 1.0, 5.0)} == {1.0}
+
+
+@pytest.mark.parametrize("text", ["[table\n", "[arm]\n", ""])
+def test_a_bad_cell_file_is_named(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "cell.toml"
+    file.write_text(text)
+    with pytest.raises(LaboratoryError, match=r"cell\.toml"):
+        read_site(file)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(LaboratoryError, match=r"nowhere\.toml: cannot be read"):
+        read_site(tmp_path / "nowhere.toml")
+
+
+def test_a_cell_without_a_key_is_refused(site: Site) -> None:
+    cell = {name: dict(table) for name, table in site.cell.items() if isinstance(table, dict)}
+    del cell["camera"]["focal_px"]
+    with pytest.raises(LaboratoryError, match="focal_px"):
+        read_truth(cell, "A")
+
+
+@pytest.mark.parametrize("text", ["", "joint = []\nlink = []\n"])
+def test_a_bad_arm_file_is_named(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "arm.toml"
+    file.write_text(text)
+    with pytest.raises(LaboratoryError, match=r"arm\.toml"):
+        read_arm(file)
