@@ -299,7 +299,7 @@ class Arm:
         else:
             self._refused = self._guard.advance(trajectory)
             if self._mode == "follow":
-                self._follower.executed(self._setpoint.age)
+                self._follower.executed(self._ports.now)
 
     def _follow_on(self, now: float) -> None:
         """Aim at the newest prediction, or hold where it is stale or the action silent."""
@@ -308,9 +308,10 @@ class Arm:
             self._rest("silent_action")
             return
         if not follower.take(self._setpoint, now):
-            if follower.fresh(self._setpoint):
+            if follower.fresh(now):
                 return
             trajectory.aim(None)
+            follower.drop()
             self._reason = "no_setpoint"
             return
         plan = follower.plan_with(self._interceptor, trajectory, now)
@@ -334,19 +335,18 @@ class Arm:
         """How far (rad) the measured joints are off the path commanded of late; how late they are on it does not count."""
         if self._mode == "off" or not self._commanded:
             return 0.0
-        q = self._measured
-        return min(max(abs(a - b) for a, b in zip(then, q, strict=True)) for then in self._commanded)
+        return min(map(self._off_by, self._commanded))
 
     def _in_place(self) -> bool:
+        """Whether the measured joints are where they are wanted: at the end of a move, or at the newest plan's pose."""
+        if self._mode == "follow":
+            plan = self._follower.plan
+            return plan is not None and self._off_by(plan.q) < NEAR_PLACE
         target = self._trajectory.target
-        if self._mode == "off" or target is None:
-            return False
-        follows = self._mode == "follow"
-        if not follows and not self._trajectory.arrived():
-            return False
-        return max(abs(a - b) for a, b in zip(target, self._measured, strict=True)) < (
-            NEAR_PLACE if follows else IN_PLACE
-        )
+        return self._mode == "move" and target is not None and self._trajectory.arrived() and self._off_by(target) < IN_PLACE
+
+    def _off_by(self, q: Sequence[float]) -> float:
+        return max(abs(a - b) for a, b in zip(q, self._measured, strict=True))
 
     def _standing(self) -> bool:
         return max(map(abs, self._measured_speed)) < _STANDING

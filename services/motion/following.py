@@ -11,6 +11,8 @@ from services.motion.trajectory import Trajectory
 
 STALE_PERIODS: Final = 3
 """Periods of the stream after which a set point is not executed any more."""
+FROZEN: Final = 0.03
+"""s before the ball from which the cup keeps still: what can still be corrected is less than what a moving rim can spoil."""
 ROUNDING: Final = 1e-9
 """s by which rounding may carry an age."""
 
@@ -24,41 +26,55 @@ class Follower:
         self.plan: Plan | None = None
         self._made = 0.0
         self._prediction: Prediction | None = None
+        self._values: tuple[float, ...] | None = None
         self.count = 0
         self.age = math.inf
+        self._came = -math.inf
         self.refused = 0
         self.oldest = 0.0
         self.stale = 0
 
     def begin(self, count: int) -> None:
         """Forget what was: only set points that come from now on count."""
-        self.plan, self._prediction, self.count, self.age = None, None, count, math.inf
+        self.plan, self._prediction, self._values = None, None, None
+        self.count, self.age, self._came = count, math.inf, -math.inf
 
-    def fresh(self, setpoint: Setpoint) -> bool:
-        """Whether the last set point taken may be executed (still); notes its age."""
-        self.age = setpoint.age if self._prediction is not None else math.inf
-        return setpoint.values is not None and self.age <= STALE_PERIODS * self._period + ROUNDING
+    def fresh(self, now: float) -> bool:
+        """Whether the last good set point may be executed (still); notes its age."""
+        self.age = now - self._came
+        return self.age <= STALE_PERIODS * self._period + ROUNDING
 
-    def executed(self, age: float) -> None:
-        """A cycle went towards a set point of this age: kept account of apart from what decides about it."""
+    def executed(self, now: float) -> None:
+        """A cycle went towards the last good set point: its age is kept account of apart from what decides about it."""
+        age = now - self._came
         self.oldest = max(self.oldest, age)
         self.stale += age > STALE_PERIODS * self._period + ROUNDING
 
     def take(self, setpoint: Setpoint, now: float) -> bool:
-        """Take a new set point if there is one that may be executed."""
-        if setpoint.count == self.count or setpoint.values is None:
+        """Take a set point with new values if there is one that may be executed; a repeat only makes the last one younger."""
+        values = setpoint.values
+        if setpoint.count == self.count or values is None:
             return False
         self.count = setpoint.count
-        try:
-            self._prediction = Prediction.parse(setpoint.values, setpoint.age)
-        except ValueError:
-            self.refused += 1
-            return False
-        return self.fresh(setpoint)
+        if values != self._values:
+            try:
+                self._prediction = Prediction.parse(values, setpoint.held)
+            except ValueError:
+                self.refused += 1
+                return False
+        self._came = now - setpoint.age
+        new, self._values = values != self._values, values
+        return self.fresh(now) and new
+
+    def drop(self) -> None:
+        """The last set point has become stale: its values count as new if they come again."""
+        self._values = None
 
     def plan_with(self, interceptor: Interceptor, trajectory: Trajectory, now: float) -> Plan | None:
         """Plan for the prediction just taken; None if it cannot be reached (the plan of before is forgotten)."""
         assert self._prediction is not None
+        if self.plan is not None and self.plan.arrival - (now - self._made) < FROZEN:
+            return self.plan
         self.plan = interceptor.plan(
             self.strategy,
             self._prediction,

@@ -83,6 +83,8 @@ LATE_COST: Final = 20.0
 """Weight of each second too late."""
 EARLY: Final = 0.05
 """s of slack below which time costs more."""
+HASTE: Final = 0.05
+"""s of motion from which the full margin is asked for."""
 KEEP: Final = 0.03
 """Cost by which another candidate must be better than the present one."""
 
@@ -142,9 +144,16 @@ class Interceptor:
         )
         hands = layout.hands
         arrival = prediction.time_to_go + np.repeat(fall[:, 3], hands)
-        slack = arrival - strategy.margin - times
+        haste = np.minimum(times / HASTE, 1.0)  # a cup that is in place already needs no margin
+        slack = arrival - strategy.margin * haste - times
         closed = CLOSED_COST * np.repeat(np.maximum(strategy.opening - fall[:, 4], 0.0), hands)
-        cost = times + layout.off_depth + closed + LATE_COST * np.maximum(-slack, 0.0) + np.maximum(EARLY - slack, 0.0)
+        cost = (
+            times
+            + layout.off_depth
+            + closed
+            + LATE_COST * np.maximum(-slack, 0.0)
+            + haste * np.maximum(EARLY - slack, 0.0)
+        )
         cost[np.isnan(cost)] = np.inf
         if before is not None and before.candidate < len(cost):
             cost[before.candidate] -= KEEP

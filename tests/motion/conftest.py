@@ -102,12 +102,18 @@ class Stream:
     def __init__(self, rig: Rig, period: float) -> None:
         self._rig, self._period = rig, period
         self._newest: tuple[float, ...] | None = None
-        self._came = -math.inf
+        self._came = self._first = -math.inf
         self.count = 0
 
     def put(self, values: Sequence[float]) -> None:
+        if tuple(values) != self._newest:
+            self._first = self._rig.now
         self._newest, self._came = tuple(values), self._rig.now
         self.count += 1
+
+    @property
+    def held(self) -> float:
+        return self._rig.now - self._first
 
     @property
     def age(self) -> float:

@@ -37,7 +37,7 @@ def test_the_nominal_arm_is_the_published_one() -> None:
 )
 def test_a_bad_arm_is_refused_by_name(old: str, new: str, says: str) -> None:
     assert old in ARM
-    with pytest.raises(ModelError, match="puma560.toml") as caught:
+    with pytest.raises(ModelError, match=r"puma560\.toml") as caught:
         read_arm(ARM.replace(old, new, 1))
     assert says in str(caught.value)
 
