@@ -52,6 +52,7 @@ __all__ = ["Callee", "CancelRun", "Commanded", "Inline", "Keeping", "Offer", "Or
 ERROR: Final = "error"
 COORDINATOR: Final = "coordinator"
 NODE: Final = "node"
+_NEVER: Final = float("inf")
 
 Inline = Callable[[float, Call], Outcome]
 """A service answered on the spot, in the node's loop: (now, call) to outcome. It must neither wait nor compute for long."""
@@ -147,6 +148,8 @@ class Callee:
         self.directory = directory
         self.any_directory = any_directory
         self.events = EventBoard()
+        self.soonest = _NEVER
+        """Never later than `due` (s): a shell whose timer is set for no later time need not ask for that."""
         self._keeping = keeping or Keeping()
         self._links: dict[str, _Link] = {}
         self._epochs: dict[str, int] = {}
@@ -212,7 +215,7 @@ class Callee:
             self._leases = {device: holder for device, holder in self._leases.items() if holder != peer}
         for id_, run in self._running.items():
             if run.peer == peer and run.orphan_time is not None:
-                heapq.heappush(self._timers, (now + run.orphan_time, "orphan", id_))
+                self._set_timer(now + run.orphan_time, "orphan", id_)
 
     # What callers say.
 
@@ -249,6 +252,26 @@ class Callee:
             self._end(now, peer, self._answered(now, offer.inline, call))
         else:
             self._start(now, peer, call, offer)
+
+    def answer_inline(self, now: float, peer: str, call: Call) -> Outcome | None:
+        """The outcome of a call to a service that is answered on the spot, None if it is another kind of call.
+
+        As `receive`, but the answer does not go through `messages`: the shortest way for a shell that has only this call.
+        """
+        offer = self.offers.get(call.service)
+        id_ = call.id
+        if offer is None or offer.inline is None or id_ in self._results or id_ in self._running:
+            return None
+        if (call.boot and call.boot != self.boot) or self._refusal_of_call(now, peer, call, offer) is not None:
+            return None
+        outcome = self._answered(now, offer.inline, call)
+        self._results.add(now, peer, outcome)
+        return outcome
+
+    @property
+    def has_work(self) -> bool:
+        """Whether there are orders or messages to take out."""
+        return bool(self._orders or self._messages)
 
     def _known(self, peer: str, id_: str) -> None:
         """A call that came before: tell where it stands, never run it again."""
@@ -311,7 +334,7 @@ class Callee:
         self._running[call.id] = _Run(call, peer, now, offer.device, offer.orphan_time)
         deadline = call.deadline if call.deadline is not None else offer.deadline
         if deadline is not None:
-            heapq.heappush(self._timers, (now + deadline, "deadline", call.id))
+            self._set_timer(now + deadline, "deadline", call.id)
         self._messages.append((peer, Accept(call.id)))
         self._orders.append(StartRun(call, peer))
 
@@ -453,10 +476,14 @@ class Callee:
         """When `advance` has something to do next (s), None if never."""
         while self._timers and self._timers[0][2] not in self._running:
             heapq.heappop(self._timers)
+        soonest = self._timers[0][0] if self._timers else _NEVER
         results = self._results.due()
-        if not self._timers:
-            return results
-        return self._timers[0][0] if results is None else min(results, self._timers[0][0])
+        self.soonest = soonest if results is None else min(soonest, results)
+        return self.soonest if self.soonest < _NEVER else None
+
+    def _set_timer(self, due: float, kind: str, id_: str) -> None:
+        heapq.heappush(self._timers, (due, kind, id_))
+        self.soonest = min(self.soonest, due)
 
     def _stop(self, id_: str, run: _Run, reason: str, cause: str) -> None:
         if not run.stopping:
@@ -465,6 +492,7 @@ class Callee:
 
     def _end(self, now: float, peer: str, outcome: Outcome) -> None:
         self._results.add(now, peer, outcome)
+        self.soonest = min(self.soonest, now + self._keeping.results)
         self._send(peer, outcome)
 
     def _send(self, peer: str, message: Message) -> None:

@@ -24,8 +24,9 @@ import heapq
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any, Final
 
+from services.comm.events import EventIntake
 from services.comm.messages import (
     Accept,
     Answer,
@@ -34,7 +35,6 @@ from services.comm.messages import (
     Cancel,
     Command,
     Event,
-    EventAck,
     Executed,
     Feedback,
     Hello,
@@ -43,7 +43,6 @@ from services.comm.messages import (
     Ping,
     Pong,
     Refuse,
-    ResultAck,
     Subscribe,
     Welcome,
 )
@@ -59,6 +58,7 @@ from services.comm.notice import (
     Progress,
 )
 from services.comm.plain import plain
+from services.comm.settled import Settled
 
 __all__ = [
     "Accepted",
@@ -74,12 +74,8 @@ __all__ = [
     "Progress",
 ]
 
-ERROR = "error"
-_ACKS_AT_ONCE = 64
-_REMEMBERED = 10_000
-_NEVER = float("inf")
-_K = TypeVar("_K")
-_V = TypeVar("_V")
+ERROR: Final = "error"
+_NEVER: Final = float("inf")
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,8 +97,8 @@ class Patience:
 @dataclass(slots=True)
 class _Pending:
     call: Call
-    own_boot: bool
-    """The caller of this machine named the boot himself."""
+    any_boot: bool
+    """Until it is sent, it may go to whatever boot the peer is."""
     made: float
     sent: bool = False
     accepted: bool = False
@@ -124,6 +120,8 @@ class Caller:
         self.boot = ""
         """Boot of the peer, empty before the first link."""
         self.offers: tuple[str, ...] = ()
+        self.soonest = _NEVER
+        """Never later than `due` (s): a shell whose timer is set for no later time need not ask for that."""
         self._auto_ack = auto_ack
         self._patience = patience or Patience()
         self._refusal = ""
@@ -131,14 +129,10 @@ class Caller:
         self._pending: dict[str, _Pending] = {}
         self._commands: dict[str, float] = {}
         self._names: tuple[str, ...] | None = None
-        self._settled: dict[str, bool] = {}
-        self._given_up: dict[str, None] = {}
-        self._seen: dict[str, dict[int, None]] = {}
-        self._unsafe: dict[str, set[int]] = {}
+        self._events = EventIntake()
         self._accepts: deque[tuple[float, str]] = deque()
         self._deadlines: list[tuple[float, str]] = []
-        self._acks: list[str] = []
-        self._acks_due = _NEVER
+        self._settled = Settled(self._patience.acknowledge)
         self._messages: list[Message] = []
         self._notices: list[Notice] = []
         self._takers: Mapping[type, Callable[[float, Any], None]] = {
@@ -158,30 +152,44 @@ class Caller:
     def open(self, now: float) -> None:
         """Say HELLO (lock step; in real time the connection does it)."""
         self._messages.append(self.hello)
-        self._held_until = now + self._patience.reconnect
+        self.connecting(now)
 
     def connecting(self, now: float) -> None:
         """A first connection is being tried: calls made now wait for it as long as for a reconnection."""
         self._held_until = now + self._patience.reconnect
+        self.soonest = min(self.soonest, self._held_until)
 
     def call(self, now: float, call: Call) -> None:
         """Make a call. Raises ValueError for an id that is under way, NotPlainError for arguments that no message carries."""
-        if call.id in self._pending:
-            raise ValueError(f"call {call.id}: this id is under way already")
-        call = self._stamped(call)
-        pending = _Pending(call, bool(call.boot), now)
-        self._pending[call.id] = pending
+        self.begin(
+            now, call.id, call.service, call.arguments, call.deadline, call.parent, call.seed, call.epoch, call.boot
+        )
+
+    def begin(
+        self,
+        now: float,
+        id: str,  # noqa: A002
+        service: str,
+        arguments: Mapping[str, Any],
+        deadline: float | None = None,
+        parent: str = "",
+        seed: int = 0,
+        epoch: int = 0,
+        boot: str = "",
+    ) -> None:
+        """`call` by the fields of a Call."""
+        if id in self._pending:
+            raise ValueError(f"call {id}: this id is under way already")
+        if arguments:
+            arguments = plain(arguments, "arguments")
+        call = Call(id, service, arguments, deadline, epoch or self.hello.epoch, boot or self.boot, parent, seed)
+        pending = self._pending[id] = _Pending(call, not boot, now)
         if self.up:
             self._send(now, pending)
         elif self._refusal:
-            self._end(call.id, "refused", self._refusal, Executed.NO)
+            self._end(id, "refused", self._refusal, Executed.NO)
         elif self._held_until is None or now >= self._held_until:
-            self._end(call.id, "unreachable", f"{self.peer} is not there", Executed.NO)
-
-    def _stamped(self, call: Call) -> Call:
-        arguments = plain(call.arguments, "arguments") if call.arguments else call.arguments
-        epoch = call.epoch or self.hello.epoch
-        return Call(call.id, call.service, arguments, call.deadline, epoch, call.boot, call.parent, call.seed)
+            self._end(id, "unreachable", f"{self.peer} is not there", Executed.NO)
 
     def cancel(self, now: float, id: str, reason: str = "") -> None:  # noqa: A002
         """Ask for a call's run to be stopped; it still ends with one `Ended`. An id that is not under way is left alone."""
@@ -207,6 +215,7 @@ class Caller:
             self._no_answer(command.id, "unreachable")
             return
         self._commands[command.id] = now + self._patience.answer
+        self.soonest = min(self.soonest, now + self._patience.answer)
         self._messages.append(replace(command, data=plain(command.data, "data")))
 
     def subscribe(self, now: float, names: Iterable[str]) -> None:
@@ -217,17 +226,14 @@ class Caller:
 
     def acknowledge(self, now: float, id: str) -> None:  # noqa: A002
         """The result of this call is safe; the peer may forget it."""
-        if self._settled.get(id) is False:
-            self._settled[id] = True
+        if self._settled.is_safe(id) is False:
             self._ack(now, id)
 
     def acknowledge_event(self, now: float, event: Event) -> None:
         """This event of its source and all before it are safe."""
-        unsafe = self._unsafe.get(event.source, set())
-        if event.number in unsafe:
-            unsafe -= {number for number in unsafe if number <= event.number}
-            if self.up:
-                self._messages.append(EventAck(event.source, event.number))
+        ack = self._events.acknowledge(event)
+        if ack is not None and self.up:
+            self._messages.append(ack)
 
     def under_way(self) -> tuple[str, ...]:
         """Ids of the calls that have not ended."""
@@ -253,19 +259,18 @@ class Caller:
 
     def _forget_boot(self) -> None:
         """The peer is another process now: what the old one was sent is lost, its event numbers begin anew."""
-        self._seen.clear()
-        self._unsafe.clear()
+        self._events.clear()
         for id_, pending in list(self._pending.items()):
             if pending.sent:
                 self._end(id_, "rebooted", f"{self.peer} was started anew", Executed.UNKNOWN)
-        self._given_up.clear()
+        self._settled.peer_is_new()
 
     def _settle_again(self, now: float, runs: Iterable[str]) -> None:
         """Runs that the peer still keeps although they ended here: stop what was given up, acknowledge what was lost."""
         for id_ in runs:
-            if id_ in self._given_up:
+            if self._settled.was_given_up(id_):
                 self._messages.append(Cancel(id_, "given up"))
-            elif self._settled.get(id_):
+            elif self._settled.is_safe(id_):
                 self._ack(now, id_)
 
     def link_down(self, now: float, reason: str, *, final: bool = False) -> None:
@@ -274,15 +279,14 @@ class Caller:
             return
         self.up = False
         self._messages.clear()
-        self._acks.clear()
-        self._acks_due = _NEVER
+        self._settled.link_lost()
         self._notices.append(PeerLost(reason))
         for id_ in list(self._commands):
             self._no_answer(id_, "lost")
         if final:
             self._end_all("lost", reason)
         else:
-            self._held_until = now + self._patience.reconnect
+            self.connecting(now)
 
     def link_refused(self, now: float, refuse: Refuse) -> None:
         """The peer refuses us: every call ends, also those to come, until it welcomes us."""
@@ -305,19 +309,17 @@ class Caller:
 
     def _take_outcome(self, now: float, outcome: Outcome) -> None:
         id_ = outcome.id
-        pending = self._pending.pop(id_, None)
-        if pending is not None:
-            self._settle(id_, self._auto_ack)
+        if self._pending.pop(id_, None) is not None:
+            self._settled.end(id_, False)
             self._notices.append(Ended(outcome))
             if self._auto_ack:
                 self._ack(now, id_)
             return
-        acked = self._settled.get(id_)
-        if acked is None:
-            self._given_up.pop(id_, None)
-            self._settle(id_, True)
+        safe = self._settled.is_safe(id_)
+        if safe is None:
+            self._settled.turn_up(id_)
             self._notices.append(Late(outcome))
-        if acked is not False:
+        if safe is not False:
             self._ack(now, id_)
 
     def _take_accept(self, now: float, accept: Accept) -> None:
@@ -334,19 +336,11 @@ class Caller:
             self._notices.append(Progress(feedback.id, feedback.fraction, feedback.data))
 
     def _take_event(self, now: float, event: Event) -> None:
-        if event.number:
-            seen = self._seen.setdefault(event.source, {})
-            unsafe = self._unsafe.setdefault(event.source, set())
-            known = event.number in seen
-            if not known:
-                _remember(seen, event.number, None)
-                if not self._auto_ack:
-                    unsafe.add(event.number)
-            if event.number not in unsafe:
-                self._messages.append(EventAck(event.source, event.number))
-            if known:
-                return
-        self._notices.append(EventArrived(event))
+        new, ack = self._events.take(event, self._auto_ack)
+        if ack is not None:
+            self._messages.append(ack)
+        if new:
+            self._notices.append(EventArrived(event))
 
     def _take_answer(self, now: float, answer: Answer) -> None:
         if self._commands.pop(answer.id, None) is not None:
@@ -390,16 +384,15 @@ class Caller:
             self._accepts.popleft()
         while self._deadlines and self._deadlines[0][1] not in self._pending:
             heapq.heappop(self._deadlines)
-        times = [self._acks_due] if self._acks else []
+        soonest = min(self._settled.due, min(self._commands.values(), default=_NEVER))
         if self._accepts:
-            times.append(self._accepts[0][0])
+            soonest = min(soonest, self._accepts[0][0])
         if self._deadlines:
-            times.append(self._deadlines[0][0])
+            soonest = min(soonest, self._deadlines[0][0])
         if self._held_until is not None:
-            times.append(self._held_until)
-        if self._commands:
-            times.append(min(self._commands.values()))
-        return min(times) if times else None
+            soonest = min(soonest, self._held_until)
+        self.soonest = soonest
+        return soonest if soonest < _NEVER else None
 
     def _accepted_or_over(self, id_: str) -> bool:
         pending = self._pending.get(id_)
@@ -409,10 +402,9 @@ class Caller:
 
     def messages(self, now: float | None = None) -> list[Message]:
         """What to send, in order; each message is given once. Acknowledgements wait for others until `now` reaches theirs."""
-        acks = self._acks
-        if acks and (len(acks) >= _ACKS_AT_ONCE or now is None or now >= self._acks_due):
-            self._messages.append(ResultAck(acks[0], tuple(acks[1:])))
-            acks.clear()
+        ack = self._settled.take_acks(now)
+        if ack is not None:
+            self._messages.append(ack)
         if not self._messages:
             return []
         messages, self._messages = self._messages, []
@@ -427,28 +419,26 @@ class Caller:
 
     def _send(self, now: float, pending: _Pending) -> None:
         call = pending.call
-        if not pending.own_boot and call.boot != self.boot:
-            call = replace(call, boot=self.boot)
-            pending.call = call
+        if pending.any_boot and call.boot != self.boot:
+            call = pending.call = replace(call, boot=self.boot)
         pending.sent = True
         pending.accepted = False
-        pending.accept_due = now + self._patience.accept
-        self._accepts.append((pending.accept_due, call.id))
+        due = pending.accept_due = now + self._patience.accept
+        self._accepts.append((due, call.id))
         self._messages.append(call)
+        if due < self.soonest:
+            self.soonest = due
 
     def _watch(self, pending: _Pending, due: float) -> None:
         pending.due = due
         heapq.heappush(self._deadlines, (due, pending.call.id))
+        self.soonest = min(self.soonest, due)
 
     def _ack(self, now: float, id_: str) -> None:
-        if not self.up:
-            return
-        if not self._acks:
-            self._acks_due = now + self._patience.acknowledge
-        self._acks.append(id_)
-
-    def _settle(self, id_: str, acked: bool) -> None:
-        _remember(self._settled, id_, acked)
+        if self.up:
+            self._settled.acknowledge(now, id_)
+            if self._settled.due < self.soonest:
+                self.soonest = self._settled.due
 
     def _give_up(self, id_: str, cause: str, text: str) -> None:
         if self.up:
@@ -465,15 +455,9 @@ class Caller:
     def _end(self, id_: str, cause: str, text: str, executed: Executed) -> None:
         pending = self._pending.pop(id_)
         if pending.sent:
-            _remember(self._given_up, id_, None)
+            self._settled.give_up(id_)
         self._notices.append(Ended(Outcome(id_, ERROR, {}, cause, text, executed)))
 
     def _no_answer(self, id_: str, cause: str) -> None:
         self._commands.pop(id_, None)
         self._notices.append(Answered(Answer(id_, False, {"cause": cause})))
-
-
-def _remember(memory: dict[_K, _V], key: _K, value: _V) -> None:
-    memory[key] = value
-    if len(memory) > _REMEMBERED:
-        del memory[next(iter(memory))]

@@ -64,6 +64,21 @@ class _ClientLink(Link):
         self._client.gone(now, self)
 
 
+class _Asked(asyncio.Future[Outcome]):
+    """Outcome of a call made by `Client.call`."""
+
+    def __init__(self, client: Client, id_: str) -> None:
+        super().__init__(loop=client.loop)
+        self._client = client
+        self._id = id_
+
+    def cancel(self, msg: Any = None) -> bool:
+        cancelled = super().cancel(msg)
+        if cancelled:
+            self._client.give_up(self._id)
+        return cancelled
+
+
 class Client:
     """Keeps a caller connected to its peer. `on_notices(now, notices)` gets what the caller has to tell, in the loop,
     but for the ends of calls made by `call`.
@@ -83,6 +98,7 @@ class Client:
         self.host = host
         self.port = port
         self.caller = caller
+        self.loop = self._loop = asyncio.get_running_loop()
         self.key = key
         self.timing = timing or Timing()
         self.limits = limits or Limits()
@@ -94,7 +110,7 @@ class Client:
         self._futures: dict[str, asyncio.Future[Outcome]] = {}
         self._numbers = 0
         self._up = asyncio.Event()
-        self._loop = asyncio.get_running_loop()
+        self._prefix = f"{caller.hello.name}/{caller.hello.boot}/"
 
     def now(self) -> float:
         """The clock that the caller lives by: monotonic, of the loop (s)."""
@@ -129,7 +145,7 @@ class Client:
 
     # Calls.
 
-    async def call(
+    def call(
         self,
         service: str,
         arguments: Mapping[str, Any] = _NO_ARGUMENTS,
@@ -137,27 +153,25 @@ class Client:
         deadline: float | None = None,
         parent: str = "",
         seed: int = 0,
-    ) -> Outcome:
-        """Call a service and wait for its outcome, which is acknowledged then. Cancelled, it cancels the call."""
+    ) -> asyncio.Future[Outcome]:
+        """Call a service: a future of its outcome, which is acknowledged when it comes. Cancelling it cancels the call."""
         self._numbers += 1
-        caller = self.caller
-        id_ = f"{caller.hello.name}/{caller.hello.boot}/{self._numbers}"
-        future: asyncio.Future[Outcome] = self._loop.create_future()
+        id_ = f"{self._prefix}{self._numbers}"
         now = self._loop.time()
-        caller.call(now, Call(id_, service, arguments, deadline, 0, "", parent, seed))
-        self._futures[id_] = future
+        self.caller.begin(now, id_, service, arguments, deadline, parent, seed)
+        future = self._futures[id_] = _Asked(self, id_)
         if len(self._futures) == 1:
             self.flush(now)
         elif not self._flushing:
             # Others are under way: let those that are made in this turn of the loop share one write.
             self._flushing = True
             self._loop.call_soon(self._flush_soon)
-        try:
-            return await future
-        except asyncio.CancelledError:
-            caller.cancel(self.now(), id_, "its caller gave up")
-            self.flush()
-            raise
+        return future
+
+    def give_up(self, id_: str) -> None:
+        """The future of this call was cancelled."""
+        self.caller.cancel(self.now(), id_, "its caller gave up")
+        self.flush()
 
     def _flush_soon(self) -> None:
         self._flushing = False
@@ -168,9 +182,13 @@ class Client:
         now = self._loop.time() if now is None else now
         messages = self.caller.messages(now)
         if messages and self._link is not None:
-            self._link.send(messages)
+            if len(messages) == 1:
+                self._link.send_one(messages[0])
+            else:
+                self._link.send(messages)
         self._tell(now)
-        self._arm()
+        if self._timer is None or self._timer.when() > self.caller.soonest:
+            self._arm()
 
     def _tell(self, now: float) -> None:
         notices = self.caller.notices()

@@ -258,13 +258,14 @@ def decode(body: bytes) -> Message:
     spec = _SPECS[kind]
     if len(body) > spec.limit:
         raise ProtocolError("too_large", f"kind {kind}: {len(body)} bytes are above the limit of {spec.limit}")
+    index = 0
     try:
         fields = _unpack(body, kind)
         if tuple(map(type, fields[1:])) != spec.types:
             fields = _other_types(spec, fields)
-        index = 0
+        last = len(fields) - 1
         for index, check in spec.checks if len(body) <= NAME_LENGTH else spec.long_checks:
-            if index < len(fields) - 1:
+            if index < last:
                 fields[index + 1] = check(fields[index + 1])
     except _FieldError as fault:
         raise ProtocolError("malformed", f"kind {kind}: {fault}") from None
@@ -287,20 +288,24 @@ class _Counter:
 
 
 def _unpack(body: bytes, kind: int) -> list[Any]:
-    options: dict[str, Any] = {}
-    if len(body) > _UNCOUNTED:
-        options["list_hook"] = options["object_hook"] = _Counter()
     try:
-        if kind == Tick.KIND:
-            fields = msgpack.unpackb(body, use_list=False, ext_hook=_extension_in, **options)
+        if len(body) <= _UNCOUNTED and kind != Tick.KIND:
+            fields = msgpack.unpackb(body, ext_hook=_no_extension)
         else:
-            fields = msgpack.unpackb(body, ext_hook=_no_extension, **options)
+            fields = _unpack_counted(body, kind)
     except (_FieldError, NotPlainError, ProtocolError) as fault:
         raise _FieldError(str(fault)) from None
     except Exception as fault:
         # msgpack raises its own kinds, ValueError, UnicodeDecodeError and RecursionError on bad bytes.
         raise _FieldError(f"not msgpack: {type(fault).__name__}") from None
-    return list(fields)
+    return fields if type(fields) is list else list(fields)
+
+
+def _unpack_counted(body: bytes, kind: int) -> Any:
+    counter = _Counter() if len(body) > _UNCOUNTED else None
+    if kind == Tick.KIND:
+        return msgpack.unpackb(body, use_list=False, ext_hook=_extension_in, list_hook=counter, object_hook=counter)
+    return msgpack.unpackb(body, ext_hook=_no_extension, list_hook=counter, object_hook=counter)
 
 
 def _other_types(spec: _Spec, fields: list[Any]) -> list[Any]:

@@ -1,12 +1,12 @@
-"""Events of a node on their way to those who asked for them: latched ones are numbered and kept until they are safe."""
+"""Events on their way: at the node latched ones are numbered and kept until they are safe, at the caller taken once."""
 
 from __future__ import annotations
 
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
-from services.comm.messages import Event
+from services.comm.messages import Event, EventAck
 
 KEPT = 1_000
 """Latched events of one source that are kept; then the oldest gives way."""
@@ -110,3 +110,39 @@ class EventBoard:
             listener.durable and peer not in kept.safe and kept.event.name in listener.names
             for peer, listener in self._listeners.items()
         )
+
+
+class EventIntake:
+    """Events of one peer as its caller takes them: each number of a source once."""
+
+    def __init__(self) -> None:
+        self._seen: dict[str, OrderedDict[int, None]] = {}
+        self._unsafe: dict[str, set[int]] = {}
+
+    def take(self, event: Event, safe: bool) -> tuple[bool, EventAck | None]:
+        """Whether this event is new, and what to acknowledge. `safe`: its owner needs no time to make it so."""
+        if not event.number:
+            return True, None
+        seen = self._seen.setdefault(event.source, OrderedDict())
+        unsafe = self._unsafe.setdefault(event.source, set())
+        new = event.number not in seen
+        if new:
+            seen[event.number] = None
+            if len(seen) > 2 * KEPT:
+                del seen[next(iter(seen))]
+            if not safe:
+                unsafe.add(event.number)
+        return new, None if event.number in unsafe else EventAck(event.source, event.number)
+
+    def acknowledge(self, event: Event) -> EventAck | None:
+        """This event of its source and those before it are safe now; gives what to tell the peer, if anything."""
+        unsafe = self._unsafe.get(event.source, set())
+        if event.number not in unsafe:
+            return None
+        unsafe -= {number for number in unsafe if number <= event.number}
+        return EventAck(event.source, event.number)
+
+    def clear(self) -> None:
+        """The peer is another process: its numbers begin anew."""
+        self._seen.clear()
+        self._unsafe.clear()

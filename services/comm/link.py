@@ -12,9 +12,11 @@ from enum import Enum, auto
 
 from services.comm.messages import Bye, Event, Feedback, Message, Ping, Pong, Refuse
 from services.comm.security import NONCE_BYTES
-from services.comm.wire import Connection, ProtocolError, Side, State
+from services.comm.wire import Connection, ProtocolError, Side
 
 _HEARTBEATS = frozenset((Ping, Pong))
+_OWN = frozenset((Ping, Pong, Bye, Refuse))
+"""Kinds that a link deals with itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +105,7 @@ class Link(asyncio.Protocol):
         self._heart = Heart(0.0, timing)
         self._timer: asyncio.TimerHandle | None = None
         self._pings = 0
+        self._opening = True
 
     # For subclasses.
 
@@ -135,14 +138,15 @@ class Link(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         now = self.loop.time()
         self._heart.hear(now)
-        connection = self.connection
-        was_opening = connection.state is State.OPENING
         try:
-            messages = connection.receive_data(data)
+            messages = self.connection.receive_data(data)
         except ProtocolError as fault:
             self._refuse(now, fault)
             return
-        if was_opening and self._transport is not None and (out := connection.data_to_send()):
+        if len(messages) == 1 and type(messages[0]) not in _OWN and not self._opening:
+            self.took(now, messages)
+            return
+        if self._opening and self._transport is not None and (out := self.connection.data_to_send()):
             self._transport.write(out)
         self._sort(now, messages)
 
@@ -184,6 +188,7 @@ class Link(asyncio.Protocol):
 
     def opened(self) -> None:
         """The handshake is over: the heart beats from now on."""
+        self._opening = False
         now = self.loop.time()
         self._heart = Heart(now, self.timing)
         if self._timer is not None:
@@ -198,6 +203,13 @@ class Link(asyncio.Protocol):
         transport.write(b"".join([self._bytes(message) for message in messages]))
         if self.slow and transport.get_write_buffer_size() > self.limits.buffer_hard:
             self.cut(f"it does not read: {self.limits.buffer_hard} bytes wait for it")
+
+    def send_one(self, message: Message) -> None:
+        """Send one message."""
+        if self.slow or self._transport is None or self._transport.is_closing():
+            self.send((message,))
+            return
+        self._transport.write(self._bytes(message))
 
     def _bytes(self, message: Message) -> bytes:
         if self.slow and (type(message) is Feedback or (type(message) is Event and not message.number)):

@@ -18,6 +18,7 @@ DEPTH = 32
 """How deep plain data may be nested."""
 
 SCALARS = frozenset((NoneType, bool, int, float, str, bytes))
+_SIMPLE = SCALARS - {int}
 _KEYS = frozenset((str,))
 _INT_MIN, _INT_MAX = -(2**63), 2**64 - 1
 
@@ -48,6 +49,8 @@ def _plain(value: Any, where: str, depth: int) -> Any:
         return value
     if depth == 0:
         raise NotPlainError(f"{where}: nested deeper than {DEPTH} levels")
+    if kind is dict and _KEYS.issuperset(map(type, value)) and _SIMPLE.issuperset(map(type, value.values())):
+        return value.copy()
     if kind is dict or isinstance(value, Mapping):
         return {_key(key, where): _plain(item, f"{where}.{key}", depth - 1) for key, item in value.items()}
     if kind is list or kind is tuple:
@@ -56,7 +59,7 @@ def _plain(value: Any, where: str, depth: int) -> Any:
 
 
 def _plain_list(value: Sequence[Any], where: str, depth: int) -> list[Any]:
-    if set(map(type, value)) <= {float, str, bool, bytes, NoneType}:
+    if _SIMPLE.issuperset(map(type, value)):
         return list(value)
     return [_plain(item, f"{where}[{index}]", depth - 1) for index, item in enumerate(value)]
 
@@ -82,20 +85,20 @@ def _key(key: Any, where: str) -> str:
 def inspect(value: Any, extra: frozenset[type] = frozenset(), depth: int = DEPTH) -> None:
     """Refuse decoded data that is not plain or nested too deep. `extra` are further leaf types. Raises NotPlainError."""
     kind = type(value)
-    if kind in SCALARS or kind in extra:
-        return
     if kind is dict:
         if not _KEYS.issuperset(map(type, value)):
             raise NotPlainError("a key of a map is not a str")
         inner = value.values()
     elif kind is list or kind is tuple:
         inner = value
+    elif kind in SCALARS or kind in extra:
+        return
     else:
         raise NotPlainError(f"a {kind.__name__} is not plain data")
     if depth == 0:
         raise NotPlainError(f"nested deeper than {DEPTH} levels")
-    if not SCALARS.issuperset(map(type, inner)):
-        for item in inner:
+    for item in inner:
+        if type(item) not in SCALARS:
             inspect(item, extra, depth - 1)
 
 

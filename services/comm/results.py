@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -30,8 +31,9 @@ class ResultStore:
     def __init__(self, keeping: Keeping, forgotten: Callable[[str], None]) -> None:
         self._keeping = keeping
         self._forgotten = forgotten
-        self._results: dict[str, tuple[Outcome, str, float]] = {}
-        self._ids: dict[str, float] = {}
+        # A plain dict is slow to find its first entry once many were deleted before it.
+        self._results: OrderedDict[str, tuple[Outcome, str, float]] = OrderedDict()
+        self._ids: OrderedDict[str, float] = OrderedDict()
 
     def __contains__(self, id_: str) -> bool:
         return id_ in self._results or id_ in self._ids

@@ -16,7 +16,7 @@ from collections.abc import Callable
 
 from services.comm.callee import Callee, Order
 from services.comm.link import Limits, Link, Timing
-from services.comm.messages import Answer, Bye, Hello, Message, Outcome, Refuse
+from services.comm.messages import Answer, Bye, Call, Hello, Message, Outcome, Refuse
 from services.comm.security import is_loopback, require_key
 from services.comm.wire import ProtocolError, Side, State
 
@@ -37,6 +37,14 @@ class _ServerLink(Link):
 
     def took(self, now: float, messages: list[Message]) -> None:
         callee, peer = self._server.callee, self.peer
+        if peer and len(messages) == 1 and type(messages[0]) is Call:
+            outcome = callee.answer_inline(now, peer, messages[0])
+            if outcome is not None:
+                # The shortest way for what is answered on the spot.
+                self.send_one(outcome)
+                if callee.has_work:
+                    self._server.flush(now)
+                return
         for message in messages:
             if isinstance(message, Hello):
                 self._greet(now, message)
@@ -150,7 +158,9 @@ class Server:
         messages = callee.messages()
         if len(messages) == 1:
             peer, message = messages[0]
-            self._send(peer, [message])
+            link = self._links.get(peer)
+            if link is not None:
+                link.send_one(message)
         elif messages:
             by_peer: dict[str, list[Message]] = {}
             for peer, message in messages:
@@ -165,6 +175,8 @@ class Server:
             link.send(messages)
 
     def _arm(self) -> None:
+        if self._timer is not None and self._timer.when() <= self.callee.soonest:
+            return
         due = self.callee.due()
         if due is None or (self._timer is not None and self._timer.when() <= due):
             return

@@ -233,6 +233,8 @@ class Connection:
         if self._phase in (_Phase.CLOSING, _Phase.CLOSED):
             return messages
         buffer = self._buffer
+        if not buffer and self._phase is _Phase.OPEN and self._is_one_frame(data):
+            return [self._only(data)]
         buffer += data
         start = 0
         try:
@@ -247,6 +249,34 @@ class Connection:
             raise ProtocolError(fault.code, fault.text, messages) from None
         del buffer[:start]
         return messages
+
+    def _is_one_frame(self, data: bytes) -> bool:
+        """The usual case: these bytes are one whole frame of a kind that may come."""
+        length = len(data) - _HEADER
+        return (
+            length > SEAL_BYTES + 2
+            and data[_HEADER + 1] in self._may_come
+            and int.from_bytes(data[:_HEADER], "big") == length <= LIMITS[data[_HEADER + 1]]
+        )
+
+    def _only(self, data: bytes) -> Message:
+        """The message of one whole frame of an open connection."""
+        try:
+            body = data[_HEADER:] if self._seal_in is None else self._unsealed(data[_HEADER:])
+            message = decode(body)
+        except ProtocolError:
+            self._enter(_Phase.CLOSED)
+            raise
+        if message.KIND in _LAST:
+            self._enter(_Phase.CLOSED)
+        return message
+
+    def _unsealed(self, body: bytes) -> bytes:
+        assert self._seal_in is not None
+        body, tag = body[:-SEAL_BYTES], body[-SEAL_BYTES:]
+        if not same(tag, self._seal_in.next(body)):
+            raise ProtocolError("bad_seal", "a frame was changed, repeated, lost or made without the key")
+        return body
 
     def _frame_end(self, start: int) -> int:
         """Where the frame that begins at `start` ends; 0 if it is not there yet. Refuses a bad one as early as it can."""
@@ -267,11 +297,8 @@ class Connection:
         return start + _HEADER + length if have >= length else 0
 
     def _take(self, body: bytes) -> Message | None:
-        seal = self._seal_in
-        if seal is not None:
-            body, tag = body[:-SEAL_BYTES], body[-SEAL_BYTES:]
-            if not same(tag, seal.next(body)):
-                raise ProtocolError("bad_seal", "a frame was changed, repeated, lost or made without the key")
+        if self._seal_in is not None:
+            body = self._unsealed(body)
         message = decode(body)
         if self._phase is not _Phase.OPEN:
             return self._take_opening(message, body)
