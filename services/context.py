@@ -23,7 +23,8 @@ class CallFailed(Exception):  # noqa: N818 - what happened, not a class of error
         self.result = result
 
 
-def _never() -> bool:
+def never() -> bool:
+    """What a run waits for that only waits for time."""
     return False
 
 
@@ -69,7 +70,7 @@ class RunContext:
 
     def sleep(self, seconds: float) -> Wait:
         """Awaitable: goes on after so many seconds of the cell's clock."""
-        return Wait(_never, self.now + seconds)
+        return Wait(never, self.now + seconds)
 
     def publish(self, stream: str, values: Sequence[float]) -> None:
         """Make `values` the newest set point of a stream; repeated while the run goes on and stands by it."""

@@ -14,7 +14,7 @@ from typing import Any
 from services.action import Cancelled, Result, Wait
 from services.callables import describe
 from services.comm.directory import ActionEntry
-from services.context import RunContext
+from services.context import RunContext, never
 from services.runs import Begin
 
 STEPS = 10_000
@@ -69,6 +69,12 @@ class Execution:
     def over(self) -> bool:
         """Whether the action's own code has nothing more to do."""
         return self.coroutine is None
+
+    @property
+    def polls(self) -> bool:
+        """Whether it waits for more than time."""
+        waits = self.wait is not None and self.wait.ready is not never
+        return waits or self.phase is Phase.SETTLING
 
     def due(self) -> float | None:
         """When it is worth a look without anything coming in (s)."""

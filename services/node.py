@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from services.action import Status
-from services.comm.callee import Callee, CancelRun, Commanded, Inline, Offer, StartRun
+from services.comm.callee import Callee, CancelRun, Commanded, Inline, Offer, Order, StartRun
 from services.comm.caller import Caller
 from services.comm.directory import MEMORY, MEMORY_CALLS, ActionEntry, Directory, DirectoryError, ServiceEntry, resolve
 from services.comm.messages import Call, Executed, Hello, Outcome
 from services.comm.notice import Ended as CallEnded
+from services.comm.notice import Notice
 from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
 from services.inline_service import inline_service
 from services.memory import Memory, event_name
@@ -24,6 +25,8 @@ GENERAL = ""
 """Key of the place of actions that need no device."""
 LOOP = "*"
 """Key of the place of services that wait, in the node's own loop."""
+STREAM_PREFIX = "stream:"
+"""Name of a stream's address service: this and the stream's name."""
 ANSWER_WITHIN = 1.0
 """Seconds that the devices have to answer an operator's command."""
 _OWN_CAUSES = ("deadline", "orphan")
@@ -57,7 +60,11 @@ class Node:
         clock: Callable[[], float],
         places: Mapping[str, Place],
         virtual: bool = False,
+        connect: Callable[[str], None] | None = None,
+        stream_address: Callable[[str], Mapping[str, Any] | None] | None = None,
     ) -> None:
+        """`connect(peer)` is called when the first call to a peer is about to be made; `stream_address(stream)` tells where a
+        set-point stream of this node is received."""
         self.directory = directory
         self.name = name
         self.boot = boot
@@ -65,6 +72,8 @@ class Node:
         waiting = {s.name: _as_action(s) for s in services if inspect.iscoroutinefunction(resolve(s.run))}
         self.places: dict[str, Place] = {**places, LOOP: InlinePlace(waiting, clock=clock, virtual=virtual)}
         self.memory = Memory(self._memory_changed)
+        self._connect = connect
+        self._stream_address = stream_address
         self.callee = Callee(name, boot, self._offers(waiting), directory=directory.hash)
         self.callers: dict[str, Caller] = {}
         self.sent: list[tuple[str, Sent]] = []
@@ -85,6 +94,9 @@ class Node:
             if service.node == self.name:
                 scope = "local" if service.local else "network"
                 offers.update(self._service_offers(service, scope, service.name in waiting))
+        if self._stream_address is not None:
+            streams = [s for s in self.directory.streams if self.directory.where(s) == self.name]
+            offers.update({stream_service(s): Offer(inline=self._stream_call) for s in streams})
         return offers
 
     def _service_offers(self, service: ServiceEntry, scope: str, waits: bool) -> dict[str, Offer]:
@@ -99,6 +111,8 @@ class Node:
         """The calling end for a peer, made when first wanted."""
         if peer not in self.callers:
             self.callers[peer] = Caller(peer, self.hello(), auto_ack=True)
+            if self._connect is not None:
+                self._connect(peer)
         return self.callers[peer]
 
     def hello(self) -> Hello:
@@ -117,7 +131,7 @@ class Node:
         self.callee.advance(now)
         for caller in self.callers.values():
             caller.advance(now)
-        self._obey(now)
+        self.obey(now, self.callee.orders())
         self._answer_runs(now)
         for name in self._timers.advance(now):
             self.callee.raise_event(now, name, source=name)
@@ -142,8 +156,9 @@ class Node:
 
     # --- orders of callers -------------------------------------------------------------------------------------------
 
-    def _obey(self, now: float) -> None:
-        for order in self.callee.orders():
+    def obey(self, now: float, orders: Iterable[Order]) -> None:
+        """Carry out what the callee orders."""
+        for order in orders:
             if isinstance(order, StartRun):
                 self._start(now, order.call)
             elif isinstance(order, CancelRun):
@@ -232,14 +247,17 @@ class Node:
         self.caller(peer).call(now, call)
 
     def _answer_runs(self, now: float) -> None:
-        """Hand the ends of calls to the runs that made them."""
         for caller in self.callers.values():
-            for notice in caller.notices():
-                if isinstance(notice, CallEnded):
-                    end = notice.outcome
-                    key = self._asked.pop(end.id, None)
-                    if key is not None:
-                        self.places[key].take(now, Answered(end.id, end.status, end.values, end.cause, end.text))
+            self.take_notices(now, caller.notices())
+
+    def take_notices(self, now: float, notices: Iterable[Notice]) -> None:
+        """Hand the ends of calls to the runs that made them."""
+        for notice in notices:
+            if isinstance(notice, CallEnded):
+                end = notice.outcome
+                key = self._asked.pop(end.id, None)
+                if key is not None:
+                    self.places[key].take(now, Answered(end.id, end.status, end.values, end.cause, end.text))
 
     # --- services of the node itself ---------------------------------------------------------------------------------
 
@@ -253,9 +271,23 @@ class Node:
         data = {"name": name, "value": value, "version": version}
         self.callee.raise_event(self._now, event_name(name), data, source=MEMORY, latched=True)
 
+    def _stream_call(self, now: float, call: Call) -> Outcome:
+        """Where a set-point stream is received, and the ticket that opens it."""
+        stream = call.service.removeprefix(STREAM_PREFIX)
+        address = self._stream_address(stream) if self._stream_address else None
+        if address is None:
+            text = f"nobody receives {stream!r} at the moment"
+            return Outcome(call.id, Status.ERROR, {}, "not_ready", text, Executed.NO)
+        return Outcome(call.id, Status.SUCCESS, address)
+
     def _service_event(self, service: str, name: str, data: Mapping[str, Any]) -> None:
         self.callee.raise_event(self._now, name, data, source=service, latched=True)
 
 
 def _as_action(service: ServiceEntry) -> ActionEntry:
     return ActionEntry(service.name, service.run, "", service.node)
+
+
+def stream_service(stream: str) -> str:
+    """Name of the service that tells where a stream is received."""
+    return STREAM_PREFIX + stream

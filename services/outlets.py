@@ -58,7 +58,7 @@ class Outlets:
             late = now - outlet.next
             # absolute deadlines keep the rate; after a gap of more than a period the grid starts anew
             outlet.next = (outlet.next if late < outlet.period else now) + outlet.period
-            sent.append(Sent(outlet.run, stream, outlet.values, now - outlet.published))
+            sent.append(Sent(outlet.run, stream, outlet.values, max(0.0, now - outlet.published)))
         return sent
 
     def due(self) -> float | None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 from services.comm.directory import ActionEntry
 from services.device import Driver
 from services.remote import CyclicDriver, DeviceCommand, DirectDevice, RemoteDriver
-from services.runner import DeviceControl, Runner
+from services.runner import Runner
 from services.runs import Hold, Order, Report, Stop, Told
 
 SLACK = 1e-6  # s: binary fractions of a period must not cost a whole tick
@@ -37,7 +38,10 @@ class Place(Protocol):
 
 
 class InlinePlace:
-    """A place in the node's own process: in lock step, and for services of the node's loop."""
+    """A place whose actions run in this process: in lock step, in a worker, and for services of the node's loop.
+
+    Its device is a `driver` of this process, or one elsewhere at the end of a `remote`, or none.
+    """
 
     def __init__(
         self,
@@ -45,32 +49,36 @@ class InlinePlace:
         *,
         clock: Callable[[], float],
         driver: Driver | None = None,
+        remote: RemoteDriver | None = None,
         streams: Mapping[str, float] | None = None,
         substitutes: Mapping[str, Callable[..., Any]] | None = None,
         virtual: bool = False,
     ) -> None:
+        self._actions = actions
         self._driver = driver
         self._cyclic = CyclicDriver(driver) if driver is not None and driver.period else None
-        self._remote = RemoteDriver(self._post, clock)
+        self._remote = remote or RemoteDriver(self._post, clock)
         self._commands: list[DeviceCommand] = []
         self._next_step: float | None = None
         self._told: list[Report] = []
         self._runner = Runner(
             actions,
             clock=clock,
-            device=self._control(),
+            device=self._remote if remote or self._cyclic else driver and DirectDevice(driver),
             streams=streams,
             substitutes=substitutes,
             virtual=virtual,
+            fenced=remote is not None,
         )
-
-    def _control(self) -> DeviceControl | None:
-        if self._driver is None:
-            return None
-        return self._remote if self._cyclic else DirectDevice(self._driver)
 
     def _post(self, command: DeviceCommand) -> None:
         self._commands.append(command)
+
+    def warm(self) -> None:
+        """Import all actions now, so that no call waits for it. One that fails says so when it is called."""
+        for action in self._actions:
+            with contextlib.suppress(ImportError):
+                self._runner.load(action)
 
     def take(self, now: float, order: Order) -> None:
         """Take an order about a run."""
@@ -100,6 +108,16 @@ class InlinePlace:
             return "stopped" if driver is None or driver.stopped() else "stopping", {}
         state = dict(driver.state()) if driver else {}
         return "up", {"runs": list(self._runner.runs), "fenced": self._runner.fenced, "state": state}
+
+    @property
+    def runs(self) -> tuple[str, ...]:
+        """Ids of the runs that have not ended."""
+        return self._runner.runs
+
+    @property
+    def polling(self) -> bool:
+        """Whether a run waits for more than time, so that `advance` must be called often."""
+        return self._runner.polling
 
     def advance(self, now: float) -> None:
         """Runs first, then as many cycles of the driver as are due."""

@@ -41,7 +41,8 @@ class Runner:
     """Runs of one place: of one device, at most one at a time (besides those that start at once), or of none, any number.
 
     Orders come in by `take`, reports go out by `reports`; in between `advance(now)` does what is due. `clock` is what
-    `ctx.now` reads. `substitutes` replace actions by other callables. With `virtual` the declared computing time passes.
+    `ctx.now` reads. `substitutes` replace actions by other callables. With `virtual` the declared computing time passes. With
+    `fenced` no run begins before the device is known to stand still.
     """
 
     def __init__(
@@ -53,6 +54,7 @@ class Runner:
         streams: Mapping[str, float] | None = None,
         substitutes: Mapping[str, Callable[..., Any]] | None = None,
         virtual: bool = False,
+        fenced: bool = False,
     ) -> None:
         self._actions = actions
         self._clock = clock
@@ -62,13 +64,18 @@ class Runner:
         self._virtual = virtual
         self._runs: dict[str, Execution] = {}
         self._reports: list[Report] = []
-        self._fenced = False
+        self._fenced = fenced
         self._held_since: float | None = None
 
     @property
     def runs(self) -> tuple[str, ...]:
         """Ids of the runs that have not ended."""
         return tuple(self._runs)
+
+    @property
+    def polling(self) -> bool:
+        """Whether a run waits for more than time, so that `advance` must be called often."""
+        return any(run.polls for run in self._runs.values())
 
     @property
     def fenced(self) -> bool:
@@ -110,8 +117,7 @@ class Runner:
 
     def advance(self, now: float) -> None:
         """Do all that is due: begin, go on, stop, end."""
-        if self._fenced and self._device is not None and self._device.stopped():
-            self._fenced = False
+        self._look_at_fence()
         held = self._held_since is not None
         for run in list(self._runs.values()):
             if not held and run.phase not in _AFTER:
@@ -127,6 +133,7 @@ class Runner:
 
     def _begin(self, begin: Begin) -> None:
         entry = self._actions.get(begin.action)
+        self._look_at_fence()
         if begin.id in self._runs:
             return
         if entry is None:
@@ -169,6 +176,10 @@ class Runner:
         self._in_action(now, run, lambda: run.call(function, arguments))
 
     # --- go on -------------------------------------------------------------------------------------------------------
+
+    def _look_at_fence(self) -> None:
+        if self._fenced and (self._device is None or self._device.stopped()):
+            self._fenced = False
 
     def _lead(self, now: float, run: Execution) -> None:
         if run.phase is Phase.NEW:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-STALE_AFTER = 3
-"""Periods without a message after which a set point counts no more."""
+from services.comm.stream import STALE_AFTER
+
 SLACK = 1e-6  # s: three periods to the tick are not yet too old
 
 
 class SetpointReceiver:
-    """Implements `services.device.Setpoint`; whoever receives the stream's messages calls `take` and `withdraw`."""
+    """Implements `services.device.Setpoint` for the driver, and the `Sink` of whoever receives the stream's messages."""
 
     def __init__(self, period: float, clock: Callable[[], float]) -> None:
         self._limit = STALE_AFTER * period + SLACK

@@ -12,6 +12,9 @@ from typing import Any
 from services.comm import directory_file
 from services.comm.party import TICK
 
+COORDINATOR = directory_file.COORDINATOR
+COORDINATOR_PORT = 7299
+"""Where the coordinator listens unless `[coordinator]` says otherwise."""
 MEMORY = "memory"
 MEMORY_CALLS = ("memory.get", "memory.put", "memory.compare_and_set", "memory.list")
 """What the node that has the global memory offers."""
@@ -33,6 +36,8 @@ class NodeEntry:
     host: str
     port: int
     sim: bool = False
+    worker_memory_mb: int = 0
+    """Limit of the address space of each worker process (MiB); 0: none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +119,8 @@ class Directory:
     links: Mapping[str, float]
     """Lock-step delays (s) by channel or "source/target" (endpoint names)."""
     keys: Mapping[str, str]
+    coordinator: NodeEntry
+    """Where the coordinator listens (in lock step)."""
     parameters: Mapping[str, str]
     """Files of numbers that the cell's programs share, by name; relative to this file."""
 
@@ -148,9 +155,13 @@ class Directory:
         return tuple(a.name for a in self.actions.values() if a.task == task)
 
     def address(self, node: str) -> tuple[str, int]:
-        """Host and port of a node."""
-        entry = self.nodes[node]
+        """Host and port of a node or of the coordinator."""
+        entry = self.coordinator if node == COORDINATOR else self.nodes[node]
         return entry.host, entry.port
+
+    def members(self) -> dict[str, tuple[str, int]]:
+        """Addresses of all members of a lock-step cell: its nodes and the coordinator."""
+        return {name: self.address(name) for name in (*self.nodes, COORDINATOR)}
 
     def same_host(self, node: str, party: str) -> bool:
         """Whether a party lives on a node's host; one that is no node (a coordinator in lock step) does."""
@@ -197,6 +208,7 @@ def parse(text: str, source: Path) -> Directory:
         timers={n: TimerEntry(n, t["node"], float(t["period"])) for n, t in tables["timers"].items()},
         links={n: float(d) for n, d in tables["links"].items()},
         keys=dict(tables["keys"]),
+        coordinator=NodeEntry(COORDINATOR, **{"host": "127.0.0.1", "port": COORDINATOR_PORT, **tables[COORDINATOR]}),
         parameters=dict(tables["parameters"]),
     )
 

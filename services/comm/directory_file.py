@@ -68,6 +68,9 @@ SHAPES: Mapping[str, Mapping[str, Key]] = {
             "a port from 1 to 65535", lambda v: isinstance(v, int) and not isinstance(v, bool) and 0 < v < 65536, True
         ),
         "sim": Key("true or false", lambda v: isinstance(v, bool)),
+        "worker_memory_mb": Key(
+            "a whole number of MiB above 0", lambda v: isinstance(v, int) and not isinstance(v, bool) and v > 0
+        ),
     },
     "devices": {"node": _name_key("a node", required=True), "driver": _path_key("Class")},
     "actions": {
@@ -98,7 +101,8 @@ FLAT: Mapping[str, Key] = {
     "parameters": Key("the path of a file, relative to this one", _text),
 }
 CHANNELS = ("call", "can", "image", "stream", "control")
-TOP = ("schema", *SHAPES, *FLAT)
+COORDINATOR = "coordinator"
+TOP = ("schema", COORDINATOR, *SHAPES, *FLAT)
 
 
 class Faults:
@@ -140,7 +144,8 @@ def read(text: str, source: str, memory: str) -> tuple[Tables, str, list[str]]:
         return {}, "", [_syntax_fault(source, str(fault))]
     _check_top(data, faults)
     tables: Tables = {name: data.get(name, {}) for name in (*SHAPES, *FLAT)}
-    for name in tables:
+    tables[COORDINATOR] = _coordinator(data, faults)
+    for name in (*SHAPES, *FLAT):
         if not isinstance(tables[name], dict):
             faults.add(name, f"is not a table; write [{name}]")
             tables[name] = {}
@@ -185,6 +190,18 @@ def _check_top(data: Mapping[str, Any], faults: Faults) -> None:
         faults.add("schema", f"{known}; write schema = {SCHEMA}, the layout that this version reads")
     if not data.get("nodes"):
         faults.add("nodes", "there is no node; write at least one [nodes.NAME] with host and port")
+
+
+def _coordinator(data: Mapping[str, Any], faults: Faults) -> dict[str, Any]:
+    """Where the coordinator listens: host and port, both with a default."""
+    given = data.get(COORDINATOR, {})
+    if not isinstance(given, dict):
+        faults.add(COORDINATOR, f"is not a table; write [{COORDINATOR}] above its keys")
+        return {}
+    shape = {key: SHAPES["nodes"][key] for key in ("host", "port")}
+    for key, value in given.items():
+        _check_key(f"{COORDINATOR}.{key}", key, value, shape, False, faults)
+    return given
 
 
 def _entries(
@@ -242,6 +259,8 @@ def _check_node(key: str, node: str, nodes: Mapping[str, Any], faults: Faults) -
 def _check_addresses(nodes: Mapping[str, Any], faults: Faults) -> None:
     taken: dict[tuple[str, int], str] = {}
     for name, entry in nodes.items():
+        if name == COORDINATOR:
+            faults.add(f"nodes.{name}", "the coordinator is no node; rename the node")
         address = (entry["host"], entry["port"])
         if address in taken:
             where = f"{address[0]}:{address[1]}"

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.comm.canbus import Frame
 from services.comm.caller import Accepted, Answered, Caller, Ended, EventArrived, Notice, Progress
+from services.comm.canbus import Frame
 from services.comm.cell import Cell, Delays
 from services.comm.channels import can_body, image_body, read_can, read_images_wanted
 from services.comm.directory import Directory, DirectoryError, parse

@@ -1,0 +1,94 @@
+"""Launches one node of services.toml on this host: `python -m services NAME [--services FILE] [--lockstep]`."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from services.comm.directory import Directory, DirectoryError, parse, verify_imports
+from services.comm.directory_file import nearest
+from services.comm.lockstep import CellError, Delays, Member
+from services.comm.security import KeyFileError, KeyNeededError, read_key
+from services.lockstep_node import LockstepNode
+from services.scripted import ScriptError
+from services.scripted import load as load_script
+from services.shell import serve
+
+EXAMPLE = "example:\n  python -m services vision --services services.toml"
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    commands = argparse.ArgumentParser(
+        prog="python -m services",
+        description=__doc__,
+        epilog=f"{EXAMPLE}\n\nexit codes: 0 ended by SIGTERM, 2 bad services.toml or device, 3 the cell lost a party",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands.add_argument("name", help="the node's name in services.toml")
+    commands.add_argument("--services", metavar="FILE", type=Path, default=Path("services.toml"), help="location file")
+    commands.add_argument("--lockstep", action="store_true", help="be a member of a lock-step cell")
+    commands.add_argument("--mock", metavar="FILE", default="", help="replace the actions that this file scripts")
+    return commands
+
+
+def read(path: Path, name: str) -> tuple[Directory, str]:
+    """The location file and its text. Raises DirectoryError when it is bad or this node cannot run here."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as fault:
+        raise DirectoryError((f"{path}: {fault.strerror}; name the file with --services",)) from fault
+    directory = parse(text, path)
+    if name not in directory.nodes:
+        raise DirectoryError((f"{path}: no node is named {name!r}{nearest(name, directory.nodes)}",))
+    if directory.nodes[name].sim:
+        raise DirectoryError((f"{path}: {name!r} is the simulated laboratory; launch it with python -m sim",))
+    faults = verify_imports(directory, name)
+    if faults:
+        raise DirectoryError(faults)
+    return directory, text
+
+
+def run_lockstep(directory: Directory, name: str, mock: str) -> None:
+    """Be a member of a lock-step cell of one process a node, until one of them ends it."""
+    node = LockstepNode(directory, name, substitutes=load_script(mock) if mock else None)
+    key = read_key(directory.file(directory.keys["file"])) if "file" in directory.keys else None
+    delays = Delays(directory.delays())
+    member = Member(name, [node], directory.members(), delays=delays, directory=directory.hash, key=key)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    print(f"node {name} ready for lock step, process {os.getpid()}", flush=True)
+    try:
+        member.open()
+        member.run()
+    finally:
+        node.close()
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the node; gives the exit code."""
+    options = parser().parse_args(arguments)
+    try:
+        directory, text = read(options.services, options.name)
+        if options.mock:
+            load_script(options.mock)
+        if options.lockstep:
+            run_lockstep(directory, options.name, options.mock)
+        else:
+            memory = directory.nodes[options.name].worker_memory_mb << 20
+            asyncio.run(serve(directory, options.name, text, mock=options.mock, memory=memory))
+    except (DirectoryError, ScriptError, KeyNeededError, KeyFileError, OSError) as fault:
+        print(f"python -m services {options.name}: {fault}", file=sys.stderr)
+        return 2
+    except CellError as fault:
+        print(f"python -m services {options.name}: {fault}", file=sys.stderr)
+        return 3
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,134 @@
+"""Records between a node and its own processes: msgpack over a local socket pair, nothing blocks."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import socket
+from typing import Any
+
+import msgpack
+
+LARGEST = 64 << 20
+"""Most bytes of one record, and of what waits to be read."""
+CHUNK = 1 << 18
+
+
+class Pipe:
+    """One end. `post` takes a list and sends what fits; `read` gives whole lists. `closed` once the other end is gone."""
+
+    def __init__(self, end: socket.socket) -> None:
+        end.setblocking(False)
+        self.socket = end
+        self.closed = False
+        self._unsent = bytearray()
+        self._packer = msgpack.Packer()
+        self._unpacker = msgpack.Unpacker(max_buffer_size=LARGEST)
+
+    def fileno(self) -> int:
+        """For selectors."""
+        return self.socket.fileno()
+
+    @property
+    def unsent(self) -> bool:
+        """Whether something waits until the other end reads."""
+        return bool(self._unsent)
+
+    def post(self, items: list[Any]) -> None:
+        """Send a list, or keep what does not fit for `flush`."""
+        self._unsent += self._packer.pack(items)
+        self.flush()
+
+    def flush(self) -> None:
+        """Send what waits, as much as fits."""
+        with contextlib.suppress(BlockingIOError):
+            while self._unsent and not self.closed:
+                try:
+                    del self._unsent[: self.socket.send(self._unsent)]
+                except (BrokenPipeError, ConnectionResetError):
+                    self.closed = True
+
+    def read(self) -> list[list[Any]]:
+        """All lists that have come."""
+        with contextlib.suppress(BlockingIOError):
+            while not self.closed:
+                try:
+                    data = self.socket.recv(CHUNK)
+                except ConnectionResetError:
+                    data = b""
+                if not data:
+                    self.closed = True
+                    break
+                self._unpacker.feed(data)
+        return [item for item in self._unpacker if isinstance(item, list)]
+
+    def close(self) -> None:
+        """Let it go."""
+        self.closed = True
+        self.socket.close()
+
+
+class NewestLink:
+    """Commands one way, states the other, as whole datagrams of a SOCK_SEQPACKET pair: of the states only the newest counts."""
+
+    def __init__(self, end: socket.socket) -> None:
+        end.setblocking(False)
+        self.socket = end
+        self.closed = False
+
+    def fileno(self) -> int:
+        """For selectors."""
+        return self.socket.fileno()
+
+    def send(self, items: list[Any]) -> bool:
+        """Send one datagram. False when the other end does not read or is gone; ValueError for more than fits into one."""
+        data = msgpack.packb(items)
+        try:
+            self.socket.send(data)
+        except BlockingIOError:
+            return False
+        except OSError as fault:
+            if fault.errno == errno.EMSGSIZE:
+                raise ValueError(f"{len(data)} bytes do not fit into one datagram; send less") from fault
+            self.closed = True
+            return False
+        return True
+
+    def read(self) -> list[list[Any]]:
+        """All datagrams that have come."""
+        return [msgpack.unpackb(data) for data in self._datagrams()]
+
+    def newest(self) -> list[Any] | None:
+        """The last datagram that has come, None if there is none."""
+        datagrams = self._datagrams()
+        return msgpack.unpackb(datagrams[-1]) if datagrams else None
+
+    def _datagrams(self) -> list[bytes]:
+        datagrams = []
+        with contextlib.suppress(BlockingIOError):
+            while not self.closed:
+                try:
+                    data = self.socket.recv(CHUNK)
+                except ConnectionResetError:
+                    data = b""
+                if not data:
+                    self.closed = True
+                    break
+                datagrams.append(data)
+        return datagrams
+
+    def close(self) -> None:
+        """Let it go."""
+        self.closed = True
+        self.socket.close()
+
+
+def pipe_pair() -> tuple[Pipe, socket.socket]:
+    """A pipe for this process and the socket that its child makes one of."""
+    here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+    return Pipe(here), there
+
+
+def link_pair() -> tuple[socket.socket, socket.socket]:
+    """Both ends of a `NewestLink` between two children."""
+    return socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)

@@ -1,0 +1,97 @@
+"""What a driver may reach in real time: a real or simulated bus, a camera, and the receiving ends of streams."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from services.comm.canbus import CanBus
+from services.comm.directory import DeviceEntry, Directory
+from services.comm.image import ImageSource
+from services.comm.plain import plain
+from services.comm.security import read_key
+from services.comm.stream import Incoming, StreamReceiver
+from services.setpoints import SetpointReceiver
+
+CAN_KEYS = ("interface", "channel", "bitrate")
+
+
+class ProcessPorts:
+    """Implements `services.device.Ports` for the driver of one device in its process."""
+
+    def __init__(
+        self, directory: Directory, device: DeviceEntry, clock: Callable[[], float], tickets: Mapping[str, str]
+    ) -> None:
+        self._directory = directory
+        self._device = device
+        self._clock = clock
+        self._tickets = tickets
+        self._can: CanBus | None = None
+        self._images: ImageSource | None = None
+        self._setpoints: dict[str, SetpointReceiver] = {}
+        self._incoming: dict[str, Incoming] = {}
+        self._receiver: StreamReceiver | None = None
+        self._raised: list[tuple[str, Mapping[str, Any]]] = []
+
+    @property
+    def now(self) -> float:
+        """The cell's clock (s)."""
+        return self._clock()
+
+    def can(self) -> CanBus:
+        """The bus that the device's keys `interface`, `channel`, `bitrate` (or its table `can`) name, as for python-can."""
+        if self._can is None:
+            from services.comm.can_ports import open_can  # python-can takes long to import; few processes need it
+
+            config = self._device.config
+            self._can = open_can(config.get("can") or {key: config[key] for key in CAN_KEYS if key in config})
+        return self._can
+
+    def images(self) -> ImageSource:
+        """The image source that the device's key `source` names."""
+        if self._images is None:
+            from services.comm.camera import open_images
+
+            self._images = open_images(self._device.config, self._clock)
+        return self._images
+
+    def stream(self, name: str) -> SetpointReceiver:
+        """The receiving end of a stream that services.toml leads to this device. Raises ValueError for any other."""
+        entry = self._directory.streams.get(name)
+        if entry is None or entry.to != self._device.name:
+            raise ValueError(f"no stream {name!r} leads here; write [streams.{name}] to = {self._device.name!r}")
+        if name not in self._setpoints:
+            self._setpoints[name] = setpoint = SetpointReceiver(entry.period, self._clock)
+            self._incoming[name] = Incoming(entry.period, setpoint, self._tickets[name])
+        if self._receiver is None:
+            host, keys = self._directory.nodes[self._device.node].host, self._directory.keys
+            key = read_key(self._directory.file(keys["file"])) if "file" in keys else None
+            self._receiver = StreamReceiver(self._device.name, self._incoming, host=host, key=key, clock=self._clock)
+        return self._setpoints[name]
+
+    def raise_event(self, name: str, **data: Any) -> None:
+        """Raise an external event."""
+        self._raised.append((name, plain(data, "data")))
+
+    def file(self, path: str) -> bytes:
+        """A file named in services.toml, relative to it."""
+        return self._directory.file(path).read_bytes()
+
+    def stream_ports(self) -> dict[str, int]:
+        """Port of each stream that is received here."""
+        return {} if self._receiver is None else dict.fromkeys(self._setpoints, self._receiver.address[1])
+
+    def poll(self) -> None:
+        """Take in the set points that have come."""
+        if self._receiver is not None:
+            self._receiver.poll()
+
+    @property
+    def busy(self) -> bool:
+        """Whether `poll` must be called often."""
+        return self._receiver is not None
+
+    def raised(self) -> list[tuple[str, Mapping[str, Any]]]:
+        """Events raised since the last call, in order."""
+        raised, self._raised = self._raised, []
+        return raised

@@ -1,0 +1,201 @@
+"""The asyncio shell of a node in real time: its server, its clients to other nodes, its processes, and the clock."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import secrets
+import signal
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from services.action import Status
+from services.comm.callee import Order
+from services.comm.client import Client
+from services.comm.directory import Directory, DirectoryError
+from services.comm.notice import Notice
+from services.comm.security import read_key, require_key
+from services.comm.server import Server
+from services.node import GENERAL, Node, stream_service
+from services.place import Place
+from services.worker import Setup
+from services.worker_place import WorkerPlace
+
+START_LIMIT = 30.0
+"""Seconds that the devices have to come up."""
+LEAVE_LIMIT = 4.0
+"""Seconds that the processes have to end in good order."""
+
+
+class NodeShell:
+    """A running node. Between `start` and `close` it serves; its loop does protocol and quick services only."""
+
+    def __init__(self, directory: Directory, name: str, text: str, *, mock: str = "", memory: int = 0) -> None:
+        """`text` is that of services.toml, as all processes of the node shall know it; `memory` limits workers (bytes)."""
+        self._directory = directory
+        self._name = name
+        self._loop = asyncio.get_running_loop()
+        self._tickets = {s: secrets.token_hex(16) for s in directory.streams if directory.where(s) == name}
+        self._setup = Setup(str(directory.source), text, name, "", mock, memory, os.getpid(), self._tickets)
+        self._key = read_key(directory.file(directory.keys["file"])) if "file" in directory.keys else None
+        self._workers = {device: self._worker_place(device) for device in self._devices()}
+        places: dict[str, Place] = {**self._workers}
+        self.node = Node(
+            directory,
+            name,
+            boot=secrets.token_hex(8),
+            clock=self._loop.time,
+            places=places,
+            connect=self._connect,
+            stream_address=self._stream_address,
+        )
+        self.server = Server(self.node.callee, on_orders=self._obey, key=self._key)
+        self._clients: dict[str, Client] = {}
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._timer: asyncio.TimerHandle | None = None
+        self._soon: asyncio.Handle | None = None
+        self._change = asyncio.Event()
+        self._serving = False
+
+    def _devices(self) -> list[str]:
+        devices = [d.name for d in self._directory.devices.values() if d.node == self._name]
+        general = any(a.node == self._name and not a.device for a in self._directory.actions.values())
+        return [*devices, GENERAL] if general else devices
+
+    def _worker_place(self, device: str) -> WorkerPlace:
+        return WorkerPlace(
+            replace(self._setup, device=device),
+            clock=self._loop.time,
+            changed=self._changed,
+            wanted=lambda stream: self._find_stream(device, stream),
+        )
+
+    # --- life --------------------------------------------------------------------------------------------------------
+
+    async def start(self) -> None:
+        """Bring the devices up, then listen. Raises DirectoryError when a device cannot be started, OSError, KeyNeededError."""
+        host, port = self._directory.address(self._name)
+        require_key(self._name, host, self._key)
+        try:
+            for place in self._workers.values():
+                place.start()
+            async with asyncio.timeout(START_LIMIT):
+                await self._until_ready()
+            await self.server.start(host, port)
+            self._serving = True
+        except TimeoutError:
+            await self.close()
+            late = ", ".join(device or "actions" for device, place in self._workers.items() if not place.ready)
+            raise DirectoryError((f"node {self._name}: {late} not up within {START_LIMIT:g} s",)) from None
+        except BaseException:
+            await self.close()
+            raise
+        self._step()
+
+    async def _until_ready(self) -> None:
+        while not all(place.ready for place in self._workers.values()):
+            failed = next((place.failed for place in self._workers.values() if place.failed), "")
+            if failed:
+                raise DirectoryError((failed,))
+            self._change.clear()
+            await self._change.wait()
+
+    async def close(self) -> None:
+        """Stop routines of all devices, then good-bye to all."""
+        self._cancel_timers()
+        self.node.close(self._loop.time())
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await asyncio.gather(*(client.close() for client in self._clients.values()))
+        self._serving = False
+        await self.server.close()
+        children = [child for place in self._workers.values() for child in place.children()]
+        await asyncio.gather(*(child.wait(LEAVE_LIMIT) for child in children))
+        self._cancel_timers()
+
+    def _cancel_timers(self) -> None:
+        for handle in (self._timer, self._soon):
+            if handle is not None:
+                handle.cancel()
+        self._timer = self._soon = None
+
+    # --- steps -------------------------------------------------------------------------------------------------------
+
+    def _obey(self, now: float, orders: list[Order]) -> None:
+        self.node.obey(now, orders)
+        self._changed()
+
+    def _take_notices(self, now: float, notices: list[Notice]) -> None:
+        self.node.take_notices(now, notices)
+        self._changed()
+
+    def _changed(self) -> None:
+        """Something came in: step once in this turn of the loop, however much it was."""
+        self._change.set()
+        if self._soon is None:
+            self._soon = self._loop.call_soon(self._step)
+
+    def _step(self) -> None:
+        if self._soon is not None:
+            self._soon.cancel()
+            self._soon = None
+        now = self._loop.time()
+        self.node.advance(now)
+        if self._serving:
+            self.server.flush(now)
+        for client in self._clients.values():
+            client.flush(now)
+        self._arm()
+
+    def _arm(self) -> None:
+        due = self.node.due()
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if due is not None:
+            self._timer = self._loop.call_at(max(due, self._loop.time()), self._step)
+
+    # --- other nodes -------------------------------------------------------------------------------------------------
+
+    def _connect(self, peer: str) -> None:
+        host, port = self._directory.address(peer)
+        client = Client(host, port, self.node.callers[peer], on_notices=self._take_notices, key=self._key)
+        self._clients[peer] = client
+        client.start()
+
+    def _stream_address(self, stream: str) -> Mapping[str, Any] | None:
+        place = self._workers[self._directory.streams[stream].to]
+        if stream not in place.streams:
+            return None
+        host = self._directory.nodes[self._name].host
+        return {"host": host, "port": place.streams[stream], "ticket": self._tickets[stream]}
+
+    def _find_stream(self, device: str, stream: str) -> None:
+        """An action wants to send a stream: ask its receiver's node where to."""
+        task = self._loop.create_task(self._tell_stream(device, stream))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _tell_stream(self, device: str, stream: str) -> None:
+        peer = self._directory.where(stream)
+        self.node.caller(peer)
+        outcome = await self._clients[peer].call(stream_service(stream), deadline=1.0)
+        if outcome.status == Status.SUCCESS:
+            at = outcome.values
+            self._workers[device].stream_at(stream, at["host"], at["port"], at["ticket"])
+
+
+async def serve(directory: Directory, name: str, text: str, *, mock: str = "", memory: int = 0) -> None:
+    """Run a node until SIGTERM or SIGINT; prints one line with `ready` when it serves."""
+    shell = NodeShell(directory, name, text, mock=mock, memory=memory)
+    over = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, over.set)
+    await shell.start()
+    host, port = shell.server.address
+    print(f"node {name} ready on {host}:{port}, process {os.getpid()}", flush=True)
+    await over.wait()
+    await shell.close()

@@ -1,0 +1,229 @@
+"""A process of a node: the warm worker that runs the actions of a device (or of none), or the process of a cyclic driver.
+
+Started by its node as `python -m services.worker PIPE DESCRIPTORS LINK` with the numbers of inherited sockets (-1: none). The
+node says over the pipe which it is to be. A process that makes its device's driver and finds it cyclic serves the driver alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import resource
+import select
+import selectors
+import signal
+import socket
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from services.comm.directory import Directory, DirectoryError, parse
+from services.device import Driver
+from services.device_process import DeviceLoop, take_priority
+from services.drivers import make_driver
+from services.pipe import NewestLink, Pipe
+from services.place import InlinePlace
+from services.ports import ProcessPorts
+from services.remote import DeviceCommand, DeviceState, RemoteDriver
+from services.runs import Order, Raised, Sent, flat, record
+from services.scripted import load as load_script
+from services.stream_outlets import StreamOutlets
+
+POLL = 0.002
+"""Seconds between looks at what a run waits for, when it is more than time."""
+READY, FAILED, COMMAND, PING, PONG = "ready", "failed", "command", "ping", "pong"
+WANTED, STREAM_AT = "wanted", "stream_at"
+PR_SET_PDEATHSIG = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """What the node tells its new process."""
+
+    source: str
+    """Path of services.toml, and its text as the node read it."""
+    text: str
+    node: str
+    device: str
+    """Empty: actions that need none."""
+    mock: str = ""
+    memory: int = 0
+    """Limit of the address space (bytes), 0 for none."""
+    parent: int = 0
+    """Process id of the node."""
+    tickets: Mapping[str, str] = field(default_factory=dict)
+    """What opens each stream that this node receives."""
+
+    def items(self) -> Mapping[str, Any]:
+        """As plain data."""
+        return asdict(self)
+
+
+class Worker:
+    """Runs actions: orders come and reports go over the node's pipe, device commands and states over the link."""
+
+    def __init__(
+        self,
+        setup: Setup,
+        directory: Directory,
+        node: Pipe,
+        *,
+        link: NewestLink | None = None,
+        driver: Driver | None = None,
+        ports: ProcessPorts | None = None,
+    ) -> None:
+        self._node = node
+        self._link = link
+        self._ports = ports
+        self._remote = RemoteDriver(self._post_command, time.monotonic) if link else None
+        actions = {a.name: a for a in directory.actions.values() if (a.node, a.device) == (setup.node, setup.device)}
+        scripted = load_script(setup.mock) if setup.mock else {}
+        self._place = InlinePlace(
+            actions,
+            clock=time.monotonic,
+            driver=driver,
+            remote=self._remote,
+            streams={s.name: s.period for s in directory.streams.values()},
+            substitutes={name: script for name, script in scripted.items() if name in actions},
+        )
+        self._place.warm()
+        self._outlets = StreamOutlets(directory, f"{setup.node} {setup.device or 'actions'}")
+        self._connecting = False
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(node, selectors.EVENT_READ)
+        if link is not None:
+            self._selector.register(link, selectors.EVENT_READ)
+
+    def await_device(self) -> None:
+        """Wait for the first state of the driver at the other end of the link."""
+        while self._remote is not None and self._remote.age == float("inf"):
+            self._selector.select()
+            if self._link is not None:
+                self._read_link(self._link)
+
+    def run(self) -> None:
+        """Serve until the node is gone."""
+        while not self._node.closed:
+            self._selector.select(self._pause())
+            if self._link is not None:
+                self._read_link(self._link)
+            now = time.monotonic()
+            for items in self._node.read():
+                self._take(now, items)
+            if self._ports is not None:
+                self._ports.poll()
+            now = time.monotonic()
+            self._place.advance(now)
+            self._report(now)
+        self._place.close(time.monotonic())
+        self._outlets.close()
+
+    def _pause(self) -> float | None:
+        """How long nothing can be due (s), None for as long as nothing comes in."""
+        if self._node.unsent:
+            return POLL
+        due = self._place.due()
+        pause = None if due is None else max(0.0, due - time.monotonic())
+        busy = self._ports is not None and self._ports.busy
+        if self._place.polling or self._connecting or busy:
+            return POLL if pause is None else min(pause, POLL)
+        return pause
+
+    def _take(self, now: float, items: list[Any]) -> None:
+        if items[0] == PING:
+            self._node.post([PONG, items[1]])
+        elif items[0] == COMMAND:
+            self._place.command(now, items[1], items[2])
+        elif items[0] == STREAM_AT:
+            _, stream, host, port, ticket = items
+            self._outlets.found(stream, host, port, ticket)
+        else:
+            order = record(items)
+            assert isinstance(order, Order)
+            self._place.take(now, order)
+
+    def _report(self, now: float) -> None:
+        for report in self._place.reports():
+            if not isinstance(report, Sent):
+                self._node.post(flat(report))
+            elif self._outlets.send(now, report):
+                self._node.post([WANTED, report.stream])
+        self._connecting = self._place.runs != () and self._outlets.advance()
+        for name, data in self._ports.raised() if self._ports else ():
+            self._node.post(flat(Raised("", name, data)))
+        if self._node.unsent:
+            self._node.flush()
+
+    def _read_link(self, link: NewestLink) -> None:
+        items = link.newest()
+        if items is not None and self._remote is not None:
+            self._remote.take(DeviceState(*items))
+        if link.closed:
+            # Without its driver nothing here can be done; the node starts both again.
+            sys.exit(0)
+
+    def _post_command(self, command: DeviceCommand) -> None:
+        assert self._link is not None
+        if not self._link.send([command.number, command.verb, dict(command.body)]):
+            raise ConnectionError("the driver's process does not take commands")
+
+
+def end_with(parent: int) -> None:
+    """Be killed when the node is (prctl(2)), also in the middle of an action that hangs."""
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        sys.exit(0)
+
+
+def _first(node: Pipe) -> Setup:
+    while True:
+        select.select([node], [], [])
+        for items in node.read():
+            return Setup(**items[0])
+        if node.closed:
+            sys.exit(0)
+
+
+def serve(node: Pipe, descriptors: socket.socket | None, link: NewestLink | None) -> None:
+    """Be what the node says. Faults of the driver go back to it as text."""
+    setup = _first(node)
+    if setup.memory:
+        resource.setrlimit(resource.RLIMIT_AS, (setup.memory, setup.memory))
+    try:
+        directory = parse(setup.text, Path(setup.source))
+        if link is None and setup.device:
+            ports = ProcessPorts(directory, directory.devices[setup.device], time.monotonic, setup.tickets)
+            driver = make_driver(directory, directory.devices[setup.device], ports)
+            if driver.period and descriptors is not None:
+                node.post([READY, {"period": driver.period, "streams": ports.stream_ports(), "fifo": take_priority()}])
+                DeviceLoop(driver, ports, node, descriptors).run()
+                return
+            worker = Worker(setup, directory, node, driver=driver, ports=ports)
+            streams = ports.stream_ports()
+        else:
+            end_with(setup.parent)
+            worker, streams = Worker(setup, directory, node, link=link), {}
+    except (DirectoryError, OSError, ValueError) as fault:
+        node.post([FAILED, str(fault)])
+        return
+    worker.await_device()
+    node.post([READY, {"period": None, "streams": streams, "fifo": False}])
+    worker.run()
+
+
+def main(arguments: list[str]) -> None:
+    """Entry point of the process."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)  # the node decides when its children end
+    pipe, descriptors, link = (int(a) for a in arguments)
+    end = socket.socket(fileno=descriptors) if descriptors >= 0 else None
+    with contextlib.suppress(BrokenPipeError):
+        serve(Pipe(socket.socket(fileno=pipe)), end, NewestLink(socket.socket(fileno=link)) if link >= 0 else None)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

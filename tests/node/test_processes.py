@@ -1,0 +1,487 @@
+"""Nodes as real processes: calls, hanging and dying actions, cyclic drivers, streams, memory, and clean ends."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from services.comm.caller import Caller
+from services.comm.client import Client
+from services.comm.directory import Directory, parse
+from services.comm.messages import Answer, Call, Command, Hello, Outcome
+from services.comm.notice import Accepted, Answered, EventArrived, Notice
+from tests.node.conftest import OUTSIDE
+
+pytestmark = pytest.mark.processes
+ROOT = Path(__file__).parents[2]
+
+CELL = """\
+schema = 1
+[nodes.left]
+host = "127.0.0.1"
+port = {left}
+worker_memory_mb = 900
+[nodes.right]
+host = "127.0.0.1"
+port = {right}
+[devices.slide]
+node = "left"
+driver = "toy_cell.drivers:Slide"
+period = 0.004
+speed = 4.0
+[devices.eye]
+node = "right"
+driver = "toy_cell.drivers:Eye"
+[streams.points]
+to = "slide"
+period = 0.02
+[timers.beat]
+node = "right"
+period = 0.02
+[services.memory]
+node = "right"
+[services.sum_service]
+node = "right"
+run = "toy_cell.actions:add"
+[services.slow_service]
+node = "right"
+run = "toy_cell.actions:slow_service"
+[actions]
+go = {{ run = "toy_cell.actions:go", task = "move", device = "slide" }}
+follow = {{ run = "toy_cell.actions:follow", task = "move", device = "slide" }}
+hang_moving = {{ run = "toy_cell.actions:hang_moving", task = "move", device = "slide", deadline = 0.3 }}
+crash_arm = {{ run = "toy_cell.actions:segfault", task = "move", device = "slide" }}
+lead = {{ run = "toy_cell.actions:lead", task = "see", device = "eye" }}
+eye_pid = {{ run = "toy_cell.actions:pid", task = "see", device = "eye" }}
+hang_eye = {{ run = "toy_cell.actions:hang", task = "see", device = "eye", deadline = 0.2 }}
+add = {{ run = "toy_cell.actions:add", task = "sum", node = "left" }}
+nap = {{ run = "toy_cell.actions:nap", task = "sum", node = "left", orphan_time = 0.2 }}
+relay = {{ run = "toy_cell.actions:relay", task = "sum", node = "left" }}
+swap_left = {{ run = "toy_cell.actions:swap", task = "sum", node = "left" }}
+swap_right = {{ run = "toy_cell.actions:swap", task = "sum", node = "right" }}
+hang = {{ run = "toy_cell.actions:hang", task = "sum", node = "left", deadline = 0.3 }}
+segfault = {{ run = "toy_cell.actions:segfault", task = "sum", node = "left" }}
+leave = {{ run = "toy_cell.actions:leave", task = "sum", node = "left" }}
+eat = {{ run = "toy_cell.actions:eat", task = "sum", node = "left" }}
+pid = {{ run = "toy_cell.actions:pid", task = "sum", node = "left" }}
+tell = {{ run = "toy_cell.actions:tell", task = "sum", node = "left" }}
+"""
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+class Operator:
+    """Clients of all nodes, under the role of a coordinator."""
+
+    def __init__(self, directory: Directory) -> None:
+        self.directory = directory
+        self.clients: dict[str, Client] = {}
+        self.notices: list[Notice] = []
+        self.changed = asyncio.Event()
+        self.numbers = 0
+        self.boot = os.urandom(8).hex()
+
+    async def connect(self, *nodes: str) -> None:
+        for node in nodes:
+            hello = Hello(1, 1, "coordinator", "operator", f"{self.boot} {node}", 1, self.directory.hash)
+            caller = Caller(node, hello, auto_ack=True)
+            host, port = self.directory.address(node)
+            self.clients[node] = Client(host, port, caller, on_notices=self._take)
+            self.clients[node].start()
+            assert await self.clients[node].connected(10.0)
+
+    def _take(self, now: float, notices: list[Notice]) -> None:
+        self.notices += notices
+        self.changed.set()
+
+    async def call(self, service: str, deadline: float | None = None, /, **arguments: Any) -> Outcome:
+        client = self.clients[self.directory.where(service)]
+        return await asyncio.wait_for(client.call(service, arguments, deadline=deadline, seed=3), 15.0)
+
+    async def heard(self, kind: type[Any], fits: Callable[[Any], bool] = lambda _: True) -> Any:
+        async with asyncio.timeout(10.0):
+            while True:
+                for notice in self.notices:
+                    if isinstance(notice, kind) and fits(notice):
+                        return notice
+                self.changed.clear()
+                await self.changed.wait()
+
+    async def command(self, node: str, verb: str, target: str = "") -> Answer:
+        self.numbers += 1
+        client, identity = self.clients[node], f"{verb} {self.numbers}"
+        client.caller.command(client.now(), Command(identity, verb, target))
+        client.flush()
+        answered = await self.heard(Answered, lambda notice: notice.answer.id == identity)
+        answer: Answer = answered.answer
+        return answer
+
+    async def until(self, holds: Callable[[], Awaitable[bool]], timeout: float = 10.0) -> None:
+        async with asyncio.timeout(timeout):
+            while not await holds():
+                await asyncio.to_thread(select_nothing)
+
+    async def close(self) -> None:
+        for client in self.clients.values():
+            await client.close()
+
+
+def select_nothing() -> None:
+    """Let some milliseconds pass without taking the loop."""
+    import select
+
+    select.select([], [], [], 0.01)
+
+
+class Nodes:
+    """The node processes of a cell."""
+
+    def __init__(self, folder: Path, *names: str, text: str = CELL, mock: str = "") -> None:
+        self.file = folder / "services.toml"
+        self.file.write_text(text.format(left=free_port(), right=free_port()))
+        self.directory = parse(self.file.read_text(), self.file)
+        self.processes = {name: self._start(name, mock) for name in names}
+        for name, process in self.processes.items():
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            assert "ready" in line, f"{name}: {line!r}"
+
+    def _start(self, name: str, mock: str) -> subprocess.Popen[str]:
+        extra = ["--mock", mock] if mock else []
+        return subprocess.Popen(
+            [sys.executable, "-m", "services", name, "--services", str(self.file), *extra],
+            env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{OUTSIDE}"},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def stop(self) -> dict[str, int]:
+        codes = {}
+        for process in self.processes.values():
+            if process.poll() is None:
+                process.terminate()
+        for name, process in self.processes.items():
+            process.communicate(timeout=10)
+            codes[name] = process.returncode
+        return codes
+
+
+@pytest.fixture(scope="module")
+def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Nodes]:
+    """Both nodes, shared by the tests that leave them as they were."""
+    running = Nodes(tmp_path_factory.mktemp("cell"), "left", "right")
+    yield running
+    assert running.stop() == {"left": 0, "right": 0}
+
+
+@asynccontextmanager
+async def operator_of(directory: Directory, *names: str) -> AsyncIterator[Operator]:
+    operator = Operator(directory)
+    await operator.connect(*names)
+    try:
+        yield operator
+    finally:
+        await operator.close()
+
+
+@pytest.fixture
+async def operator(nodes: Nodes) -> AsyncIterator[Operator]:
+    """Connected to both."""
+    async with operator_of(nodes.directory, "left", "right") as one:
+        yield one
+
+
+async def pids(operator: Operator, node: str, device: str) -> dict[str, int]:
+    answer = await operator.command(node, "status", device)
+    found: dict[str, int] = answer.data["devices"][device or node]["pids"]
+    return found
+
+
+def alive(pid: int) -> bool:
+    """Whether a process exists and is no zombie."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+async def test_actions_services_and_memory_across_nodes(operator: Operator) -> None:
+    assert (await operator.call("add", a=2, b=3)).values == {"sum": 5}
+    end = await operator.call("relay", a=4)
+    assert end.values["sum"] == 6 and end.values["version"] == 1
+    assert end.values["pid"] == (await operator.call("pid")).values["pid"], "the worker is not warm"
+    assert (await operator.call("slow_service", seconds=0.05)).seconds >= 0.05
+    bad = await operator.call("add", c=1)
+    assert (bad.cause, bad.executed) == ("bad_arguments", "no")
+
+
+async def test_two_nodes_share_a_variable_without_losing_an_update(operator: Operator) -> None:
+    ends = await asyncio.gather(operator.call("swap_left", times=20), operator.call("swap_right", times=20))
+    assert [(end.status, end.text) for end in ends] == [("success", "")] * 2
+    assert (await operator.call("memory.get", name="count")).values["value"] == 40
+
+
+async def test_events_progress_and_pulses(operator: Operator) -> None:
+    right = operator.clients["right"]
+    right.caller.subscribe(right.now(), ["beat", "memory:sum"])
+    right.flush()
+    await operator.call("relay", a=1)
+    await operator.heard(EventArrived, lambda notice: notice.event.data.get("value") == 3)
+    await operator.heard(EventArrived, lambda notice: notice.event.name == "beat")
+    call = Call(f"told {operator.boot}", "tell", {"name": "hello"}, seed=3)
+    left = operator.clients["left"]
+    left.caller.call(left.now(), call)
+    left.flush()
+    event = (await operator.heard(EventArrived, lambda notice: notice.event.name == "hello")).event
+    assert event.run == call.id and event.number >= 1
+
+
+async def test_a_cyclic_device_moves_and_is_paced(operator: Operator) -> None:
+    end = await operator.call("go", to=0.8)
+    assert end.status == "success" and end.values["position"] == pytest.approx(0.8)
+    assert end.seconds >= 0.19, "4 m/s is the slide's limit"
+    first = await operator.command("left", "status", "slide")
+    await operator.call("nap", seconds=0.4)
+    second = await operator.command("left", "status", "slide")
+    cycles = [a.data["devices"]["slide"]["state"]["cycles"] for a in (first, second)]
+    assert cycles[1] - cycles[0] >= 50, "100 cycles are due in 0.4 s"
+    refused = await operator.call("go", to=1e6)
+    assert refused.cause == "refused" and "beyond the rail" in refused.text
+
+
+async def test_set_points_from_node_to_node(operator: Operator) -> None:
+    following = asyncio.create_task(operator.call("follow", seconds=1.0))
+    leading = await operator.call("lead", seconds=0.8)
+    end = await following
+    assert leading.status == "success"
+    assert end.values["count"] >= 15 and end.values["position"] > 0.05
+
+
+async def test_a_hanging_action_is_ended_at_its_deadline_while_the_node_answers(operator: Operator) -> None:
+    before = await pids(operator, "left", "")
+    hanging = asyncio.create_task(operator.call("hang"))
+    await operator.heard(Accepted)
+    answered = 0
+    while not hanging.done():
+        status = await operator.command("left", "status", "slide")
+        assert status.ok
+        answered += 1
+    end = await hanging
+    assert (end.status, end.cause, end.executed) == ("error", "deadline", "yes")
+    assert "killed" in end.text or "deadline" in end.text
+    assert answered >= 3
+    assert (await operator.call("add", a=1)).values == {"sum": 2}
+    after = await pids(operator, "left", "")
+    assert before != after and not alive(before["actions"])
+
+
+async def test_a_hanging_action_that_moves_has_its_device_stopped_first(operator: Operator) -> None:
+    drivers = await pids(operator, "left", "slide")
+    end = await operator.call("hang_moving")
+    assert (end.cause, end.executed) == ("deadline", "yes")
+    status = await operator.command("left", "status", "slide")
+    state = status.data["devices"]["slide"]["state"]
+    assert state["stops"] >= 1 and state["position"] < 20.0, "the slide ran on"
+    again = await operator.call("go", to=state["position"])
+    assert (again.status, again.text) == ("success", "")
+    now = await pids(operator, "left", "slide")
+    assert now["driver"] == drivers["driver"] and now["actions"] != drivers["actions"]
+
+
+@pytest.mark.parametrize(("service", "says"), [("segfault", "SIGSEGV"), ("leave", "exited with code 7")])
+async def test_a_dying_worker_is_reported_and_started_again(operator: Operator, service: str, says: str) -> None:
+    end = await operator.call(service)
+    assert (end.status, end.cause, end.executed) == ("error", "worker_died", "unknown")
+    assert says in end.text
+    assert (await operator.call("add", a=1)).values == {"sum": 2}
+
+
+async def test_kill_9_of_a_worker_in_mid_run(operator: Operator) -> None:
+    assert (await operator.call("go", to=0.0)).status == "success"
+    running = asyncio.create_task(operator.call("go", to=90.0))
+    await operator.until(lambda: _moving(operator))
+    found = await pids(operator, "left", "slide")
+    os.kill(found["actions"], signal.SIGKILL)
+    end = await running
+    assert (end.cause, end.executed) == ("worker_died", "unknown") and "SIGKILL" in end.text
+    first = await operator.command("left", "status", "slide")
+    await operator.call("nap", seconds=0.1)
+    second = await operator.command("left", "status", "slide")
+    states = [a.data["devices"]["slide"]["state"] for a in (first, second)]
+    assert states[0]["position"] == states[1]["position"], "the slide did not stop"
+    assert states[1]["cycles"] > states[0]["cycles"], "the driver's process stopped too"
+
+
+async def _moving(operator: Operator) -> bool:
+    status = await operator.command("left", "status", "slide")
+    return float(status.data["devices"]["slide"]["state"]["position"]) > 0.5
+
+
+async def test_kill_9_of_a_driver(operator: Operator) -> None:
+    assert (await operator.call("go", to=0.0)).status == "success"
+    running = asyncio.create_task(operator.call("go", to=90.0))
+    await operator.until(lambda: _moving(operator))
+    found = await pids(operator, "left", "slide")
+    os.kill(found["driver"], signal.SIGKILL)
+    end = await running
+    assert (end.status, end.cause, end.executed) == ("error", "device_died", "unknown"), end.text
+    assert (await operator.call("go", to=0.0)).status == "success"
+    now = await pids(operator, "left", "slide")
+    assert now["driver"] != found["driver"] and not alive(found["actions"])
+
+
+async def test_memory_has_a_limit(operator: Operator) -> None:
+    end = await operator.call("eat", megabytes=4000)
+    assert end.status == "error" and "MemoryError" in end.text
+    assert (await operator.call("eat", megabytes=10)).values == {"bytes": 10 << 20}
+
+
+async def test_a_device_without_cycle_has_one_process(operator: Operator) -> None:
+    found = await pids(operator, "right", "eye")
+    assert found == {"actions": (await operator.call("eye_pid")).values["pid"]}
+    end = await operator.call("hang_eye")
+    assert end.cause == "deadline"
+    assert (await operator.call("eye_pid")).values["pid"] != found["actions"]
+
+
+async def test_cancel_hold_and_release(operator: Operator) -> None:
+    left = operator.clients["left"]
+    running = asyncio.create_task(operator.call("go", to=91.0))
+    await operator.heard(Accepted)
+    assert (await operator.command("left", "hold", "slide")).data["answers"] == {"slide": "held"}
+    first = await operator.command("left", "status", "slide")
+    await operator.call("nap", seconds=0.1)
+    second = await operator.command("left", "status", "slide")
+    positions = [a.data["devices"]["slide"]["state"]["position"] for a in (first, second)]
+    assert positions[0] == positions[1]
+    await operator.command("left", "release", "slide")
+    await operator.until(lambda: _beyond(operator, positions[1]))
+    busy = await operator.call("go", to=0.0)
+    assert (busy.cause, busy.executed) == ("busy", "no")
+    left.caller.cancel(left.now(), left.caller.under_way()[0], "enough")
+    left.flush()
+    end = await running
+    assert (end.cause, end.executed) == ("cancelled", "yes")
+    eye = await operator.command("right", "hold", "eye")
+    assert not eye.ok and eye.data["answers"] == {"eye": "cannot hold"}
+
+
+async def _beyond(operator: Operator, position: float) -> bool:
+    status = await operator.command("left", "status", "slide")
+    return float(status.data["devices"]["slide"]["state"]["position"]) > position
+
+
+async def test_an_orphaned_run_is_stopped(nodes: Nodes, operator: Operator) -> None:
+    other = Operator(nodes.directory)
+    hello = Hello(1, 1, "coordinator", "leaver", "boot", 1, nodes.directory.hash)
+    client = Client(*nodes.directory.address("left"), Caller("left", hello, auto_ack=True), on_notices=other._take)
+    client.start()
+    assert await client.connected(5.0)
+    client.caller.call(client.now(), Call("orphan", "nap", {"seconds": 60.0}))
+    client.flush()
+    await other.heard(Accepted)
+    await client.close()
+
+    async def gone() -> bool:
+        status = await operator.command("left", "status")
+        return "orphan" not in status.data["devices"]["left"]["runs"]
+
+    await operator.until(gone, 5.0)
+
+
+async def test_sigterm_ends_a_node_and_all_its_processes(tmp_path: Path) -> None:
+    running = Nodes(tmp_path, "left")
+    async with operator_of(running.directory, "left") as operator:
+        children = {**await pids(operator, "left", "slide"), "general": (await pids(operator, "left", ""))["actions"]}
+        call = Call("last", "go", {"to": 80.0})
+        left = operator.clients["left"]
+        left.caller.call(left.now(), call)
+        left.flush()
+        await operator.heard(Accepted)
+        assert await asyncio.to_thread(running.stop) == {"left": 0}
+    assert not [name for name, pid in children.items() if alive(pid)]
+
+
+async def test_kill_9_of_a_node_ends_its_processes(tmp_path: Path) -> None:
+    running = Nodes(tmp_path, "left")
+    async with operator_of(running.directory, "left") as operator:
+        children = {**await pids(operator, "left", "slide"), "general": (await pids(operator, "left", ""))["actions"]}
+        hanging = asyncio.create_task(operator.call("hang", 30.0))
+        await operator.heard(Accepted)
+        running.processes["left"].kill()
+        assert (await hanging).executed == "unknown"
+
+        async def gone() -> bool:
+            return not any(map(alive, children.values()))
+
+        await operator.until(gone, 5.0)
+    assert running.stop() == {"left": -9}
+
+
+async def test_scripted_actions(tmp_path: Path) -> None:
+    script = tmp_path / "script.toml"
+    script.write_text(
+        'schema = 1\n[[actions.add]]\nvalues = { sum = 7 }\n[[actions.add]]\nstatus = "error"\ncause = "tired"\n'
+    )
+    running = Nodes(tmp_path, "left", mock=str(script))
+    async with operator_of(running.directory, "left") as operator:
+        first, second, third = [await operator.call("add", anything=1) for _ in range(3)]
+        assert first.values == third.values == {"sum": 7} and (second.status, second.cause) == ("error", "tired")
+    assert running.stop() == {"left": 0}
+
+
+BAD = [
+    ("port = {left}\n", "", "nodes.left.port: is missing"),
+    ("toy_cell.drivers:Slide", "toy_cell.drivers:Slid", "has no callable 'Slid'; did you mean 'Slide'?"),
+    ("period = 0.004", "pace = 1", "devices.slide: toy_cell.drivers:Slide refuses it: is missing 'period'"),
+    ('host = "127.0.0.1"\nport = {left}', 'host = "0.0.0.0"\nport = {left}', "petrobot keys"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "says"), BAD)
+def test_a_bad_file_ends_the_node_with_one_clear_text(tmp_path: Path, old: str, new: str, says: str) -> None:
+    assert old in CELL
+    file = tmp_path / "services.toml"
+    file.write_text(CELL.replace(old, new, 1).format(left=free_port(), right=free_port()))
+    ended = subprocess.run(
+        [sys.executable, "-m", "services", "left", "--services", str(file)],
+        env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{OUTSIDE}"},
+        capture_output=True,
+        text=True,
+        timeout=20,
+    )
+    assert ended.returncode == 2 and says in ended.stderr and "Traceback" not in ended.stderr
+
+
+def test_a_run_takes_wall_time_only_while_it_must(nodes: Nodes) -> None:
+    """An idle node and its processes burn next to nothing."""
+    before, began = _cpu(nodes), time.monotonic()
+    while time.monotonic() < began + 1.0:
+        select_nothing()
+    assert _cpu(nodes) - before < 0.5 * (time.monotonic() - began), "something polls although nothing is to be done"
+
+
+def _cpu(nodes: Nodes) -> float:
+    total = 0.0
+    for process in nodes.processes.values():
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+        for pid in [str(process.pid), *children]:
+            fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+            total += (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return total
