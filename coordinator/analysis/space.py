@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from coordinator.analysis.explore import Engine, Explored, Labels, Numbers
 from coordinator.analysis.explore_integers import IntegerEngine
 from coordinator.analysis.pack import Layout, Tokens, Words
+from coordinator.analysis.structure import place_bounds, place_semiflows
 from coordinator.net import Marking, Net
 
 EngineName = Literal["auto", "integers", "numpy", "numba"]
@@ -160,7 +161,8 @@ def explore(
 ) -> Space:
     """The reachable markings of a net from its initial one.
 
-    `bounds` (tokens by place, None: unknown) only size the fields; they need not be right. With `edges=False` the edges
+    `bounds` (tokens by place, None: unknown; by default from the P-invariants) only size the fields; they need not be
+    right. With `edges=False` the edges
     are counted, not kept. Ctrl-C and limits give the partial space found so far, marked incomplete. Raises TooManyTokens
     if a place outgrows 63 bits and ImportError if numba is asked for and not installed.
     """
@@ -188,7 +190,7 @@ _HAND_OVER = "hand over"
 def _engine(name: str, begun: Explored, bounds: Sequence[int | None] | None) -> Engine:
     """An engine of machine words that goes on from what was begun, in a layout as narrow as is known to suffice."""
     seen = begun.layout.unpack_many(begun.words).max(axis=0).tolist()
-    known = bounds if bounds is not None else [None] * len(seen)
+    known = bounds if bounds is not None else place_bounds(begun.net, place_semiflows(begun.net, 2 * len(seen)))
     guess = [b if b is not None else 2 * top + 1 for b, top in zip(known, seen, strict=True)]
     begun = begun.relaid(Layout.for_net(begun.net, [max(g, top) for g, top in zip(guess, seen, strict=True)]))
     if name == "numba":

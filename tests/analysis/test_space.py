@@ -41,7 +41,7 @@ def listed(found: Explored) -> tuple[list[tuple[int, ...]], list[tuple[int, int,
     return markings, list(zip(source, found.label.tolist(), found.target.tolist(), strict=True))
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(nets())
 def test_every_engine_finds_exactly_what_the_firing_rule_gives(net: Net) -> None:
     expected = brute_force(net, 300)

@@ -1,0 +1,75 @@
+"""Karp-Miller against exhaustive search on bounded nets and against its own witnesses on unbounded ones."""
+
+from __future__ import annotations
+
+from hypothesis import assume, given, settings
+
+from coordinator.analysis.coverability import coverability
+from coordinator.analysis.space import Limits, explore
+from coordinator.net import Net
+from tests.analysis.generators import kanban, philosophers
+from tests.analysis.random_nets import brute_force, nets
+
+
+def test_a_marking_is_compared_with_its_ancestors_only() -> None:
+    """The net on which comparison with all markings gives a false omega."""
+    net = Net.build({"p0": 1, "p1": 0}, {"one": ({"p0": 1}, {"p1": 1}), "two": ({"p0": 1}, {"p1": 2})})
+    found = coverability(net)
+    assert (found.bounded, found.bounds, found.complete) == (True, (1, 2), True)
+
+
+@settings(max_examples=50, deadline=None)
+@given(nets(priorities=False, places=4, transitions=4))
+def test_bounds_are_those_of_the_markings_reached(net: Net) -> None:
+    found = coverability(net, effort=3000)
+    reached = brute_force(net, 150)
+    if found.bounded is None:
+        return
+    if reached is None:
+        space = explore(net, limits=Limits(states=2000))
+        assert all(b is None or b >= top for b, top in zip(found.bounds, space.bounds, strict=True))
+        return
+    assert found.bounded and found.complete
+    assert found.bounds == tuple(max(m[p] for m in reached[0]) for p in range(len(net.places)))
+
+
+@settings(max_examples=50, deadline=None)
+@given(nets(priorities=False, inhibitors=False, capacities=False, places=4, transitions=4))
+def test_a_witness_of_unboundedness_can_be_pumped_for_ever(net: Net) -> None:
+    found = coverability(net, effort=3000, first_omega=True)
+    assume(found.bounded is False)
+    assert found.grows and found.pump and not found.complete
+    grown = [net.place_index[name] for name in found.grows]
+    marking = list(net.replay(found.prefix))[-1]
+    pumped = list(net.replay(found.pump * 3, marking))[-1]
+    assert all(pumped[p] >= marking[p] for p in range(len(marking)))
+    assert all(pumped[p] > marking[p] for p in grown)
+
+
+def test_inhibitors_are_complemented_where_a_bound_is_known_and_else_unknown() -> None:
+    arcs = {"fill": ({"go": 1}, {"p": 1, "go": 1}), "reset": ({"p": 2}, {})}
+    open_ended = Net.build({"go": 1, "p": 0}, arcs, inhibitors={"fill": {"p": 3}})
+    found = coverability(open_ended)
+    assert found.bounded is None and "inhibited place p" in found.reason
+    settled = coverability(open_ended, bounds=[1, 3])
+    assert settled.bounded and settled.bounds == (1, 3)
+
+
+def test_priorities_leave_only_bounds_certain() -> None:
+    arcs = {"make": ({"s": 1}, {"s": 1, "p": 1}), "eat": ({"p": 1}, {})}
+    first = Net.build({"s": 1, "p": 0}, arcs, priority={"eat": 1})
+    assert explore(first).bounds == (1, 1)
+    found = coverability(first)
+    assert found.bounded is None and "priorities" in found.reason and found.bounds == (1, None)
+
+
+def test_effort_is_an_argument_and_is_owned_up_to() -> None:
+    found = coverability(kanban(2), effort=50)
+    assert found.bounded is None and "50 nodes" in found.reason and not found.complete
+
+
+def test_known_nets() -> None:
+    assert coverability(philosophers(3)).bounds == (1,) * 15
+    leak = Net.build({"p": 1, "q": 0}, {"t": ({"p": 1}, {"p": 1, "q": 1})})
+    found = coverability(leak)
+    assert found.bounded is False and found.bounds == (1, None) and found.pump == ("t",) and found.grows == ("q",)
