@@ -99,6 +99,8 @@ def _names(task: Task) -> Iterator[Fault]:
 
 def _primitive_task(p: PrimitiveTask) -> Iterator[Fault]:
     key = f"primitive_tasks.{p.name}"
+    if not p.goal:
+        yield Fault(f"{key}.goal", "it has no goal", "say in one sentence what is reached when it succeeds")
     if not p.alternatives:
         yield Fault(f"{key}.alternatives", "no action translates it", "name at least one action")
     for action, n in Counter(p.alternatives).items():
