@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,15 +18,15 @@ PLACEMENT = 0.0003
 DIRECTION = 0.0005
 """rad, the same of its direction."""
 LAID = (
-    (0.30, -0.22, 0.0),
-    (0.30, 0.22, 0.1),
-    (0.35, 0.00, 1.6),
-    (0.80, -0.20, 3.1),
+    (0.20, -0.24, 1.6),
+    (0.20, 0.20, 1.5),
+    (0.28, 0.00, 3.1),
+    (0.80, -0.27, 3.1),
     (0.80, 0.00, 0.0),
-    (0.80, 0.20, -0.1),
-    (1.25, 0.00, 1.5),
-    (1.30, 0.20, 3.2),
-    (1.30, -0.22, 0.1),
+    (0.80, 0.27, -0.1),
+    (1.32, 0.00, 0.1),
+    (1.40, 0.24, -1.5),
+    (1.40, -0.20, 1.6),
 )
 """Middle of the board on the table (m from the near edge, y) and its direction (rad)."""
 HELD = (
@@ -56,6 +58,22 @@ def board_views(
     for along, y, above, *turns in HELD:
         place = np.array([table["near_edge"] + along, y, table["top"] + above])
         yield camera.render_board(_centred(place, _turned(*turns), board), board), None
+
+
+def save_board_views(folder: Path, cell: Mapping[str, Any], camera: PinholeCamera, rng: np.random.Generator) -> None:
+    """Take the images and save them with the measured poses: view01.png, ... and views.toml, as `petrobot calibrate` reads them."""
+    board = Chessboard()
+    folder.mkdir(parents=True, exist_ok=True)
+    lines = [f"[board]\ncolumns = {board.columns}\nrows = {board.rows}\nsquare = {board.square}  # m\n"]
+    for number, (pixels, pose) in enumerate(board_views(cell, camera, rng, board), 1):
+        name = f"view{number:02}.png"
+        cv2.imwrite(str(folder / name), pixels)
+        lines.append(f'[[views]]\nfile = "{name}"')
+        if pose is not None:
+            rows = ",\n".join("  [" + ", ".join(f"{value:.9f}" for value in row) + "]" for row in pose)
+            lines.append(f"pose = [\n{rows},\n]")
+        lines.append("")
+    (folder / "views.toml").write_text("\n".join(lines), encoding="utf-8")
 
 
 def _centred(place: Array, rotation: Array, board: Chessboard) -> Array:

@@ -33,7 +33,7 @@ NOISE_ZERO = 128
 NOISE_SIZE = 1280
 LIGHT_DIRECTION = np.array([-0.25, 0.35, 0.90]) / np.linalg.norm([-0.25, 0.35, 0.90])
 """Towards the lamp, base frame."""
-LENS_STEPS = 12
+LENS_STEPS = 8
 CIRCLE = np.stack([f(np.linspace(0.0, 2.0 * np.pi, 13)[:-1]) for f in (np.cos, np.sin)], axis=-1)
 
 
@@ -54,7 +54,7 @@ class View:
     """m."""
     near_edge: float | None = None
     """m."""
-    light_gradient: Sequence[float] = (-0.30, 0.10)
+    light_gradient: Sequence[float] = (-0.50, 0.10)
     """Relative change of the light from one side of the image to the other, along u and v: the far end is dimmer."""
     vignetting: float = 0.20
     """Relative loss of light in the image's corners."""
@@ -91,6 +91,10 @@ class PinholeCamera:
         sigma = float(camera["noise"] if view.noise is None else view.noise)
         field = NOISE_ZERO + sigma * rng.standard_normal((NOISE_SIZE, NOISE_SIZE), np.float32)
         self._noise: Picture = np.clip(np.rint(field), 0, 255).astype(np.uint8)
+
+    def reseed(self, rng: np.random.Generator) -> None:
+        """Choose noise by another generator from now on."""
+        self._rng = rng
 
     # Geometry
 
@@ -217,7 +221,7 @@ class PinholeCamera:
         picture = self.background.copy()
         if box is not None:
             pixels = self._grid[box]
-            grey = supersampled(pixels, lambda at: board.grey(point_at(at)), 4) * self.illumination[box]
+            grey = supersampled(pixels, lambda at: board.grey(point_at(at)), 3) * self.illumination[box]
             seen = board.covers(point_at(pixels))
             picture[box] = np.where(seen, np.clip(np.rint(grey), 0, 255).astype(np.uint8), picture[box])
         return self._expose(picture, light)

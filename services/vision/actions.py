@@ -11,8 +11,8 @@ from typing import Any
 
 from services.action import Context, Result
 from services.vision.camera import Camera
-from services.vision.location import BackgroundSubtraction, Detector, FixedThreshold, HoughCircles, MixtureOfGaussians
 from services.vision.locating import LocateSpecification, locate
+from services.vision.location import BackgroundSubtraction, Detector, FixedThreshold, HoughCircles, MixtureOfGaussians
 from services.vision.prediction import ConstantVelocity, Kalman, LeastSquares, Predictor, Surface
 from services.vision.tracking import TrackSpecification, track
 

@@ -108,8 +108,16 @@ def calibrate(views: Sequence[BoardView], board: Board) -> Calibration:
             f"the whole board is seen in {len(seen)} of {len(views)} images, {known} of them with a known pose; "
             f"take at least {FEWEST_VIEWS}, {FEWEST_KNOWN} of them at known places of the table"
         )
-    shape = seen[0][1].pixels.shape
-    return _Adjustment(board, [c for c, _ in seen], [v.pose for _, v in seen], (shape[1], shape[0])).solve()
+    height, width = seen[0][1].pixels.shape
+    return adjust([corners for corners, _ in seen], [view.pose for _, view in seen], board, (width, height))
+
+
+def adjust(corners: Sequence[Array], poses: Sequence[Array | None], board: Board, size: tuple[int, int]) -> Calibration:
+    """Calibrate from the corners (n, 2) px of each view, its pose (4, 4) or None, and the image's width and height.
+
+    Raises CalibrationError when the views do not determine the camera.
+    """
+    return _Adjustment(board, corners, poses, size).solve()
 
 
 class _Adjustment:

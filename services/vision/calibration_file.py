@@ -9,9 +9,10 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from services.vision.calibration import Board, BoardView, Calibration
-from services.vision.optics import Optics
+from services.vision.optics import Array, Optics
 
 SCHEMA = 1
 DEFAULT = Path(__file__).with_name("calibration.toml")
@@ -32,7 +33,7 @@ schema = {SCHEMA}
 views = {calibration.views}
 residual_px = {calibration.residual_px:.4f}  # rms of the board's corners
 table_residual = {calibration.table_residual:.6f}  # m, rms of corners at known places
-table_sigma = {calibration.table_sigma:.6f}  # m, largest standard deviation of a point of the table
+table_sigma = {calibration.table_sigma:.6f}  # m, standard deviation of a point of the table, rms over the image
 
 [lens]
 focal_px = {_numbers(optics.focal)}
@@ -91,39 +92,45 @@ def read_views(folder: Path) -> tuple[list[BoardView], Board]:
     views.toml: `[board] columns, rows, square` and for each image `[[views]] file`, with `pose` (4 rows of 4 numbers, board frame
     to base frame, m) where the board lay at a known place. Raises CalibrationFileError.
     """
+    board, entries = _listed(folder)
+    return [BoardView(_grey(path), pose) for path, pose in entries], board
+
+
+def missing_views(folder: Path) -> tuple[list[tuple[Path, bool]], Board]:
+    """Images that views.toml lists and the folder lacks, each with whether its pose is known, and the board.
+
+    Raises CalibrationFileError.
+    """
+    board, entries = _listed(folder)
+    return [(path, pose is not None) for path, pose in entries if not path.exists()], board
+
+
+def _listed(folder: Path) -> tuple[Board, list[tuple[Path, Array | None]]]:
     path = folder / "views.toml"
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
         board = Board(int(data["board"]["columns"]), int(data["board"]["rows"]), float(data["board"]["square"]))
-        return [_read_view(folder, entry) for entry in data["views"]], board
+        entries = [(folder / str(entry["file"]), _pose(entry, path)) for entry in data["views"]]
     except OSError as fault:
         raise CalibrationFileError(f"{path}: cannot be read ({fault.strerror}); it lists the board images") from fault
     except tomllib.TOMLDecodeError as fault:
         raise CalibrationFileError(f"{path}: no TOML ({fault}); mend that line") from fault
     except KeyError as fault:
         raise CalibrationFileError(f"{path}: key {fault} is missing; docs/vision.md shows such a file") from fault
+    return board, entries
 
 
-def _read_view(folder: Path, entry: Mapping[str, Any]) -> BoardView:
-    path = folder / str(entry["file"])
+def _pose(entry: Mapping[str, Any], path: Path) -> Array | None:
+    if "pose" not in entry:
+        return None
+    try:
+        return np.array(entry["pose"], float).reshape(4, 4)
+    except (TypeError, ValueError) as fault:
+        raise CalibrationFileError(f"{path}: pose of {entry['file']} needs 4 rows of 4 numbers") from fault
+
+
+def _grey(path: Path) -> NDArray[np.uint8]:
     pixels = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     if pixels is None:
         raise CalibrationFileError(f"{path}: no image; mend `file` in views.toml or take the image again")
-    pose = None if "pose" not in entry else np.array(entry["pose"], float)
-    if pose is not None and pose.shape != (4, 4):
-        raise CalibrationFileError(f"{folder / 'views.toml'}: pose of {path.name} needs 4 rows of 4 numbers")
-    return BoardView(np.asarray(pixels, np.uint8), pose)
-
-
-def write_views(folder: Path, views: Sequence[BoardView], board: Board) -> None:
-    """Write board images and their views.toml as `read_views` takes them."""
-    folder.mkdir(parents=True, exist_ok=True)
-    lines = [f"[board]\ncolumns = {board.columns}\nrows = {board.rows}\nsquare = {board.square}  # m\n"]
-    for number, view in enumerate(views, 1):
-        name = f"view{number:02}.png"
-        cv2.imwrite(str(folder / name), view.pixels)
-        lines.append(f'[[views]]\nfile = "{name}"')
-        if view.pose is not None:
-            lines.append("pose = [\n" + "".join(f"  {_numbers(row)},\n" for row in view.pose) + "]")
-        lines.append("")
-    (folder / "views.toml").write_text("\n".join(lines), encoding="utf-8")
+    return np.asarray(pixels, np.uint8)

@@ -28,7 +28,7 @@ class LocateSpecification(Specification):
     """Images/s; 0: the camera's usual rate."""
     image_timeout: float = 0.8
     """s without an image until the camera counts as dead."""
-    max_residual: float = 0.003
+    max_residual: float = 0.0015
     """m, rms of the places about a straight line of even speed: above it FAILURE `inaccurate`."""
     min_ahead: float = 1.0
     """m before the near edge at least: below it FAILURE `late`."""

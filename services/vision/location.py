@@ -196,7 +196,7 @@ class HoughCircles(_WholeTable):
 class FixedThreshold(_WholeTable):
     """All that is brighter than one grey level. Cheapest, needs no background; fails where the light is uneven or changes."""
 
-    def __init__(self, view: TableView, level: float = 140.0) -> None:
+    def __init__(self, view: TableView, level: float = 160.0) -> None:
         super().__init__(view)
         self._level = level
 

@@ -51,14 +51,16 @@ async def track(
 ) -> Result:
     """Track `ball` (as a locator gave it) with the predictor that `make` makes; images end with the run."""
     camera: Camera = ctx.device
+    chase = _Chase(ctx, camera, make(camera.surface), stream, specification)
     try:
-        chase = _Chase(ctx, camera, make(camera.surface), stream, specification)
         chase.begin(ball)
+    except (KeyError, TypeError, ValueError) as fault:
+        camera.end()
+        return error("bad_ball", f"the ball to track is no locator's ball: {fault!r}")
+    try:
         result = await chase.run()
     except (CameraError, ConnectionError) as fault:
         result = error("bad_image" if isinstance(fault, CameraError) else "no_image", str(fault))
-    except (KeyError, TypeError, ValueError) as fault:
-        result = error("bad_ball", f"the ball to track is no locator's ball: {fault!r}")
     except Cancelled:
         ctx.withdraw(stream)
         camera.end()

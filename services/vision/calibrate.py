@@ -1,0 +1,122 @@
+"""The calibration command: a folder of board images becomes calibration.toml; images not there yet are taken from a camera.
+
+The folder's views.toml lists the board and the images with the known poses (docs/vision.md shows one). `add_arguments`, `run` and
+EXAMPLE serve `petrobot calibrate`; `calibrate_main` is the same without it (python -m services.vision.calibrate).
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from services.comm.camera import open_images
+from services.comm.image import ImageSource
+from services.vision.calibration import Calibration, CalibrationError, calibrate, find_corners
+from services.vision.calibration_file import (
+    CalibrationFileError,
+    calibration_text,
+    missing_views,
+    read_views,
+)
+
+Pixels = NDArray[np.uint8]
+EXAMPLE = "petrobot calibrate --views board_images --output calibration.toml"
+RATE, PATIENCE, SETTLE = 10.0, 5.0, 3
+"""Images/s while taking board images, s to wait for one, images dropped while exposure settles."""
+EXIT_BAD_INPUT = 2
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument(
+        "--views", type=Path, required=True, metavar="DIR", help="folder with views.toml and board images"
+    )
+    parser.add_argument("--output", type=Path, default=Path("calibration.toml"), metavar="FILE", help="what to write")
+    parser.add_argument(
+        "--source",
+        metavar="SOURCE",
+        help='camera that takes the images not there yet: "capture:0", "file:PATH" or "sim"',
+    )
+    parser.add_argument("--address", default="", metavar="HOST:PORT", help="of the simulated camera, with --source sim")
+
+
+def run(options: argparse.Namespace, say: Callable[[str], None] = print, wait: Callable[[str], str] = input) -> int:
+    """Calibrate; gives the exit code. `say` prints, `wait` asks the operator to place the board."""
+    try:
+        if options.source:
+            config = {"source": options.source, "address": options.address}
+            take_missing(options.views, open_images(config, time.monotonic), say, wait)
+        views, board = read_views(options.views)
+        found = calibrate(views, board)
+    except (CalibrationError, CalibrationFileError, ConnectionError, ValueError) as fault:
+        print(f"calibrate: {fault}", file=sys.stderr)
+        return EXIT_BAD_INPUT
+    options.output.write_text(calibration_text(found), encoding="utf-8")
+    say(report(found, len(views)))
+    say(f"written to {options.output}")
+    return 0
+
+
+def report(found: Calibration, views: int) -> str:
+    """What the calibration found, for people."""
+    x, y, z = found.optics.position
+    return "\n".join(
+        [
+            f"board seen whole in {found.views} of {views} images",
+            f"corners within {found.residual_px:.3f} px rms, known places within {found.table_residual * 1e3:.2f} mm rms",
+            f"a point of the table is known to {found.table_sigma * 1e3:.2f} mm (standard deviation)",
+            f"focal length {found.optics.focal[0]:.1f} px, camera at ({x:.4f}, {y:.4f}, {z:.4f}) m",
+        ]
+    )
+
+
+def take_missing(folder: Path, source: ImageSource, say: Callable[[str], None], wait: Callable[[str], str]) -> None:
+    """Take each image that views.toml lists and the folder lacks. Raises ConnectionError when the camera is dead."""
+    files, board = missing_views(folder)
+    if not files:
+        return
+    source.start(RATE)
+    try:
+        for path, known in files:
+            place = "at its known place" if known else "tilted, anywhere in view"
+            while True:
+                wait(f"{path.name}: hold the board still {place}, then press Enter ")
+                pixels = _settled(source)
+                if find_corners(pixels, board) is not None:
+                    break
+                say("the board is not seen whole; once more")
+            cv2.imwrite(str(path), pixels)
+    finally:
+        source.close()
+
+
+def _settled(source: ImageSource) -> Pixels:
+    """A fresh image after some dropped ones."""
+    taken, deadline = 0, time.monotonic() + PATIENCE
+    while time.monotonic() < deadline:
+        image = source.newest()
+        if image is None:
+            time.sleep(0.01)
+            continue
+        taken += 1
+        if taken > SETTLE:
+            return image.pixels
+    raise ConnectionError(f"no image for {PATIENCE} s: is the camera connected?")
+
+
+def calibrate_main(argv: Sequence[str] | None = None) -> int:
+    """Command line of its own; gives the exit code: 0 written, 2 bad input."""
+    parser = argparse.ArgumentParser(prog="calibrate", description=__doc__, epilog=f"example:\n  {EXAMPLE}")
+    add_arguments(parser)
+    return run(parser.parse_args(argv))
+
+
+if __name__ == "__main__":
+    sys.exit(calibrate_main())
