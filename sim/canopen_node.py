@@ -205,7 +205,7 @@ class CanopenNode:
         """The heartbeat that 1016h asks for has not come in time."""
 
     def on_nmt(self, now: float, before: NmtState) -> None:
-        """The NMT state has changed."""
+        """The NMT state has changed; after power-on or a reset it was BOOT_UP before."""
 
     def check_write(self, index: int, sub: int, value: int) -> None:
         """Raise SdoAbortError if the device's state forbids this write."""
@@ -213,7 +213,6 @@ class CanopenNode:
     # The machine.
     def boot(self, now: float) -> None:
         """Power on or reset: defaults, boot-up message, pre-operational."""
-        before = self.nmt
         self.dictionary.reset()
         self.rpdo.refresh()
         self.tpdo.refresh()
@@ -221,7 +220,7 @@ class CanopenNode:
         self._latched, self._master_due, self._beat_due = None, None, now
         self.outbox.append(heartbeat(self.node, NmtState.BOOT_UP))
         self.nmt = NmtState.PREOPERATIONAL
-        self.on_nmt(now, before)
+        self.on_nmt(now, NmtState.BOOT_UP)
 
     def receive(self, now: float, frame: Frame) -> None:
         """Take a frame off the bus."""
@@ -319,6 +318,7 @@ class CanopenNode:
         index, sub, data = request.index, request.sub, request.data
         if request.command == 0x40:
             self.dictionary.entry(index, sub)
+            self.before_reading()
             return sdo_read_reply(self.node, index, sub, self.dictionary.read(index, sub))
         if request.command != 0x20:
             raise SdoAbortError(Abort.COMMAND, index, sub)

@@ -102,7 +102,7 @@ class Drive(CanopenNode):
     # Hooks of the CANopen node.
     def on_nmt(self, now: float, before: NmtState) -> None:
         """A reset starts the state machine anew; leaving OPERATIONAL while enabled stops the motion (6007h = 2)."""
-        if self.nmt is NmtState.PREOPERATIONAL and before is not NmtState.OPERATIONAL:
+        if before is NmtState.BOOT_UP:
             if self.state not in _DOWN:
                 self._enter(State.SWITCH_ON_DISABLED)
         elif before is NmtState.OPERATIONAL and self.state is State.OPERATION_ENABLED:

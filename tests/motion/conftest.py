@@ -211,3 +211,21 @@ def rig() -> Rig:
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(20261121)
+
+
+@pytest.fixture
+def table() -> dict[str, Any]:
+    """puma560.toml as read."""
+    return TABLE
+
+
+@pytest.fixture
+def make_plant() -> Callable[[], SimplePlant]:
+    """A new simple arm at home."""
+    return lambda: SimplePlant(nominal_arm().poses["home"])
+
+
+@pytest.fixture
+def make_rig() -> type[Rig]:
+    """For rigs that are not the usual one."""
+    return Rig

@@ -1,0 +1,340 @@
+"""The python-can interface `petrobot_stream`: conformance as python-can tests its own interfaces, the hub, and bad input."""
+
+from __future__ import annotations
+
+import socket
+import struct
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.comm.can_hub import Hub
+from services.comm.can_ports import PythonCanBus, StreamPort, open_can
+from services.comm.can_stream import (
+    EXTENDED,
+    GREETING,
+    REMOTE,
+    Splitter,
+    StreamBus,
+    StreamFormatError,
+    encode,
+    parse_channel,
+)
+from services.comm.canbus import Frame
+
+PATIENCE = 5.0
+
+
+class RunningHub:
+    """A hub polled by a thread until it is closed."""
+
+    def __init__(self, channel: str) -> None:
+        self.hub = Hub(channel)
+        self.channel = self.hub.channel
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        while not self._over.is_set():
+            self.hub.poll(0.01)
+        self.hub.close()
+
+    def close(self) -> None:
+        self._over.set()
+        self._thread.join()
+
+
+@pytest.fixture(params=["tcp", "unix"])
+def channel(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
+    running = RunningHub("tcp://127.0.0.1:0" if request.param == "tcp" else f"unix://{tmp_path}/can")
+    yield running.channel
+    running.close()
+
+
+def _open(channel: str, **settings: Any) -> can.BusABC:
+    bus = can.Bus(interface="petrobot_stream", channel=channel, **settings)
+    assert isinstance(bus, StreamBus)
+    return bus
+
+
+@pytest.fixture
+def pair(channel: str) -> Iterator[tuple[can.BusABC, can.BusABC]]:
+    """Two buses that both are known to be on the hub."""
+    first, second = _open(channel), _open(channel)
+    for sender, receiver in ((first, second), (second, first)):
+        sender.send(can.Message(arbitration_id=0x7FF, is_extended_id=False))
+        while receiver.recv(timeout=0.05) is None:  # the hub had not taken the other one in yet
+            sender.send(can.Message(arbitration_id=0x7FF, is_extended_id=False))
+    _flush(first)
+    _flush(second)
+    yield first, second
+    first.shutdown()
+    second.shutdown()
+
+
+def _flush(bus: can.BusABC) -> None:
+    while bus.recv(timeout=0.02) is not None:
+        pass
+
+
+MESSAGES = [
+    can.Message(arbitration_id=0x123, is_extended_id=False, data=data) for data in (b"", b"\x00", bytes(range(8)))
+] + [
+    can.Message(arbitration_id=0x1FFFFFFF, is_extended_id=True, data=b"\x01\x02"),
+    can.Message(arbitration_id=0x1, is_extended_id=True, data=b"\x01"),
+    can.Message(arbitration_id=0x300, is_extended_id=False, is_remote_frame=True, dlc=4),
+    can.Message(arbitration_id=0x20000000 >> 1, is_extended_id=True, is_remote_frame=True, dlc=0),
+    can.Message(arbitration_id=0x0, is_extended_id=False, is_error_frame=True, data=b"\x00" * 8),
+]
+
+
+@pytest.mark.parametrize("message", MESSAGES, ids=str)
+def test_back_to_back(pair: tuple[can.BusABC, can.BusABC], message: can.Message) -> None:
+    for sender, receiver in (pair, pair[::-1]):
+        sender.send(message)
+        got = receiver.recv(PATIENCE)
+        assert got is not None
+        assert message.equals(got, timestamp_delta=None, check_channel=False, check_direction=False)
+        assert got.is_rx
+        assert got.channel is not None
+        assert sender.recv(timeout=0.0) is None, "a port does not hear itself"
+
+
+def test_many_frames_arrive_in_order_and_none_is_lost(pair: tuple[can.BusABC, can.BusABC]) -> None:
+    sender, receiver = pair
+    for number in range(2000):
+        sender.send(
+            can.Message(arbitration_id=0x100, is_extended_id=False, data=struct.pack("<I", number)), timeout=PATIENCE
+        )
+    times = []
+    for number in range(2000):
+        got = receiver.recv(PATIENCE)
+        assert got is not None
+        assert struct.unpack("<I", got.data) == (number,)
+        times.append(got.timestamp)
+    assert times == sorted(times)
+
+
+def test_receive_times_out_and_does_not_block(pair: tuple[can.BusABC, can.BusABC]) -> None:
+    assert pair[0].recv(timeout=0.0) is None
+    assert pair[0].recv(timeout=0.02) is None
+
+
+def test_filters_hold(pair: tuple[can.BusABC, can.BusABC]) -> None:
+    sender, receiver = pair
+    receiver.set_filters([{"can_id": 0x200, "can_mask": 0x700, "extended": False}])
+    for cob_id in (0x181, 0x201, 0x301, 0x2FF):
+        sender.send(can.Message(arbitration_id=cob_id, is_extended_id=False))
+    seen = [message.arbitration_id for message in (receiver.recv(PATIENCE), receiver.recv(PATIENCE)) if message]
+    assert seen == [0x201, 0x2FF]
+    assert receiver.recv(timeout=0.02) is None
+
+
+def test_own_messages_come_back_on_request(channel: str) -> None:
+    with _open(channel, receive_own_messages=True) as bus:
+        bus.send(can.Message(arbitration_id=0x10, is_extended_id=False, data=b"\x05"))
+        got = bus.recv(PATIENCE)
+        assert got is not None
+        assert not got.is_rx
+        assert got.data == b"\x05"
+
+
+def test_periodic_sending_works(pair: tuple[can.BusABC, can.BusABC]) -> None:
+    sender, receiver = pair
+    task = sender.send_periodic(can.Message(arbitration_id=0x33, is_extended_id=False), period=0.01)
+    assert all(receiver.recv(PATIENCE) is not None for _ in range(3))
+    task.stop()
+
+
+def test_can_fd_is_refused(pair: tuple[can.BusABC, can.BusABC], channel: str) -> None:
+    with pytest.raises(can.CanOperationError, match="classic CAN only"):
+        pair[0].send(can.Message(arbitration_id=1, is_fd=True, data=b"\x00" * 12))
+    with pytest.raises(can.CanInitializationError, match="classic CAN only"):
+        _open(channel, fd=True)
+
+
+@pytest.mark.parametrize(
+    ("bad", "says"),
+    [
+        ("tcp://192.0.2.1:7303", "allow_remote=True"),
+        ("tcp://0.0.0.0:7303", "allow_remote=True"),
+        ("tcp://127.0.0.1", "write tcp://127.0.0.1:7303"),
+        ("can0", "write tcp://127.0.0.1:7303"),
+        ("unix://", "write tcp://127.0.0.1:7303"),
+    ],
+)
+def test_bad_channels_are_refused_with_a_remedy(bad: str, says: str) -> None:
+    with pytest.raises(can.CanInitializationError, match=says):
+        _open(bad)
+    with pytest.raises(ValueError, match=says):
+        Hub(bad)
+
+
+def test_another_host_can_be_allowed() -> None:
+    assert parse_channel("tcp://192.0.2.1:7303", allow_remote=True)[1] == ("192.0.2.1", 7303)
+    assert parse_channel("tcp://[::1]:7303") == (socket.AF_INET6, ("::1", 7303))
+    assert parse_channel("tcp://localhost:7303")[1] == ("localhost", 7303)
+
+
+def test_without_a_hub_there_is_one_clear_error(tmp_path: Path) -> None:
+    with pytest.raises(can.CanInitializationError, match="no CAN hub at"):
+        _open(f"unix://{tmp_path}/nobody")
+    with pytest.raises(ConnectionError, match="Is the bus"):
+        open_can({"interface": "petrobot_stream", "channel": f"unix://{tmp_path}/nobody"})
+
+
+def test_a_hub_that_goes_is_noticed() -> None:
+    running = RunningHub("tcp://127.0.0.1:0")
+    bus, port = _open(running.channel), StreamPort(running.channel)
+    bus.send(can.Message(arbitration_id=1, is_extended_id=False))
+    while not port.receive():
+        pass
+    running.close()
+    with pytest.raises(can.CanOperationError, match="closed by its other end"):
+        bus.recv(PATIENCE)
+    with pytest.raises(ConnectionError):
+        port.receive()
+    bus.shutdown()
+    port.close()
+
+
+def _poll_until(hub: Hub, condition: Any) -> None:
+    for _ in range(500):
+        if condition():
+            return
+        hub.poll(0.01)
+    raise AssertionError("the hub did not get there")
+
+
+@pytest.mark.parametrize(
+    "rubbish", [b"GET / HTTP/1.1\r\n", GREETING + b"\x00\x00\x01\x23\x09", GREETING + b"\x00\x00\x08\x00\x00"]
+)
+def test_a_port_that_talks_rubbish_is_dropped_and_the_others_go_on(rubbish: bytes) -> None:
+    hub = Hub()
+    good, other = StreamPort(hub.channel), StreamPort(hub.channel)
+    host, port = parse_channel(hub.channel)[1]
+    with socket.create_connection((host, port)) as bad:
+        _poll_until(hub, lambda: hub.ports == 3)
+        bad.sendall(rubbish)
+        _poll_until(hub, lambda: hub.ports == 2)
+    assert len(hub.dropped) == 1
+    good.send(Frame(0x123, b"abc"))
+    got: list[Frame] = []
+    _poll_until(hub, lambda: got.extend(other.receive()) or got)
+    assert got == [Frame(0x123, b"abc")]
+    for each in (good, other, hub):
+        each.close()
+
+
+def test_a_port_that_does_not_read_is_dropped_and_does_not_stop_the_bus() -> None:
+    hub = Hub()
+    lazy = socket.create_connection(parse_channel(hub.channel)[1])
+    lazy.sendall(GREETING)
+    reader, mine = StreamPort(hub.channel), hub.port()
+    _poll_until(hub, lambda: hub.ports == 2)
+    sent = seen = 0
+    while hub.ports == 2:
+        for _ in range(500):
+            mine.send(Frame(0x1, bytes(8)))
+        sent += 500
+        hub.poll()
+        seen += len(reader.receive())
+        assert sent < 2_000_000
+    while seen < sent:
+        hub.poll(0.01)
+        seen += len(reader.receive())
+    assert "does not read" in hub.dropped[0]
+    for each in (lazy, reader, hub):
+        each.close()
+
+
+def test_local_ports_and_python_can_and_stream_ports_hear_each_other() -> None:
+    hub = Hub()
+    local, stream = hub.port(), StreamPort(hub.channel)
+    foreign = PythonCanBus(_open(hub.channel))
+    _poll_until(hub, lambda: hub.ports == 2)
+    frame = Frame(0x181, b"\x01\x02\x03")
+    for sender, receivers in ((local, (stream, foreign)), (stream, (local, foreign)), (foreign, (local, stream))):
+        sender.send(frame)
+        for receiver in receivers:
+            got: list[Frame] = []
+            _poll_until(hub, lambda receiver=receiver, got=got: got.extend(receiver.receive()) or got)
+            assert got == [frame]
+        assert list(sender.receive()) == []
+    local.close()
+    with pytest.raises(ConnectionError):
+        local.send(frame)
+    stream.close()
+    foreign.close()
+    hub.close()
+
+
+def test_any_python_can_interface_is_a_can_bus() -> None:
+    port = open_can({"interface": "virtual", "channel": "test_any_interface"})
+    with can.Bus(interface="virtual", channel="test_any_interface") as other:
+        port.send(Frame(0x80, b""))
+        got = other.recv(PATIENCE)
+        assert got is not None
+        assert got.arbitration_id == 0x80
+        other.send(can.Message(arbitration_id=0x1ABCDEF, is_extended_id=True))
+        other.send(can.Message(arbitration_id=0x181, is_extended_id=False, data=b"\x07"))
+        assert list(port.receive()) == [Frame(0x181, b"\x07")]
+    port.close()
+
+
+def test_a_can_bus_needs_interface_and_channel() -> None:
+    with pytest.raises(ValueError, match="needs interface and channel"):
+        open_can({"channel": "can0"})
+
+
+def test_a_socket_file_left_behind_is_replaced_but_one_in_use_is_not(tmp_path: Path) -> None:
+    path = tmp_path / "can"
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(str(path))
+    hub = Hub(f"unix://{path}")
+    with pytest.raises(OSError, match="listens on"):
+        Hub(f"unix://{path}")
+    hub.close()
+    assert not path.exists()
+
+
+FRAMES = st.lists(
+    st.tuples(st.integers(0, 0x7FF), st.binary(max_size=8)).map(lambda pair: (pair[0], len(pair[1]), pair[1]))
+    | st.tuples(st.integers(0, 0x1FFFFFFF), st.binary(max_size=8)).map(lambda p: (p[0] | EXTENDED, len(p[1]), p[1]))
+    | st.tuples(st.integers(0, 0x7FF), st.integers(0, 8)).map(lambda pair: (pair[0] | REMOTE, pair[1], b"")),
+    max_size=20,
+)
+
+
+@given(FRAMES, st.lists(st.integers(1, 40), max_size=60))
+def test_frames_survive_any_cutting_of_the_bytes(frames: list[tuple[int, int, bytes]], cuts: list[int]) -> None:
+    raw = GREETING + b"".join(encode(word, data, dlc) for word, dlc, data in frames)
+    splitter, got, at = Splitter(), [], 0
+    for cut in [*cuts, len(raw)]:
+        got += splitter.feed(raw[at : at + cut])
+        at += cut
+    assert got == frames
+
+
+@given(st.binary(max_size=200))
+def test_random_bytes_give_frames_or_a_format_error(data: bytes) -> None:
+    splitter = Splitter()
+    try:
+        frames = splitter.feed(GREETING + data)
+    except StreamFormatError:
+        return
+    assert all(dlc <= 8 for _, dlc, _ in frames)
+
+
+def test_the_framing_byte_by_byte() -> None:
+    assert encode(0x181, b"\x01\x02") == bytes.fromhex("00 00 01 81 02 01 02")
+    assert encode(0x1ABCDEF | EXTENDED, b"") == bytes.fromhex("81 ab cd ef 00")
+    assert encode(0x300 | REMOTE, b"", 4) == bytes.fromhex("40 00 03 00 04")
+    assert bytes.fromhex("50 42 43 41 4e 01") == GREETING
