@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from services.comm.events import EventBoard
@@ -43,61 +43,16 @@ from services.comm.messages import (
     Subscribe,
     Welcome,
 )
+from services.comm.orders import CancelRun, Commanded, Inline, Offer, Order, StartRun
+from services.comm.peers import COORDINATOR, Peers
 from services.comm.plain import NotPlainError, plain
 from services.comm.results import Keeping, ResultStore
-from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION, negotiate
+from services.comm.wire import NEWEST_VERSION, negotiate
 
 __all__ = ["Callee", "CancelRun", "Commanded", "Inline", "Keeping", "Offer", "Order", "StartRun"]
 
 ERROR: Final = "error"
-COORDINATOR: Final = "coordinator"
-NODE: Final = "node"
 _NEVER: Final = float("inf")
-
-Inline = Callable[[float, Call], Outcome]
-"""A service answered on the spot, in the node's loop: (now, call) to outcome. It must neither wait nor compute for long."""
-
-
-@dataclass(frozen=True, slots=True)
-class Offer:
-    """An action or service of this node."""
-
-    scope: str = "network"
-    """"network", or "local": for callers on this host alone."""
-    device: str = ""
-    orphan_time: float | None = None
-    """Seconds that a run goes on without its caller; None: for ever."""
-    deadline: float | None = None
-    """Seconds for a call that names none."""
-    inline: Inline | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class StartRun:
-    """Order: begin this run, report back with `finish`."""
-
-    call: Call
-    peer: str
-
-
-@dataclass(frozen=True, slots=True)
-class CancelRun:
-    """Order: stop this run (stop routine first); `finish` still reports its end. Given once a run."""
-
-    id: str
-    reason: str
-    """"cancelled", "deadline" or "orphan", or the caller's own words."""
-
-
-@dataclass(frozen=True, slots=True)
-class Commanded:
-    """Order: carry out a command, report back with `answer`."""
-
-    command: Command
-    peer: str
-
-
-Order = StartRun | CancelRun | Commanded
 
 
 @dataclass(slots=True)
@@ -111,18 +66,6 @@ class _Run:
     orphan_time: float | None
     stopping: bool = False
     reason: str = ""
-
-
-@dataclass(slots=True)
-class _Link:
-    """What is known of a caller, by name."""
-
-    role: str
-    boot: str
-    epoch: int
-    local: bool
-    up: bool = True
-    down_at: float = 0.0
 
 
 class Callee:
@@ -146,16 +89,13 @@ class Callee:
         self.boot = boot
         self.offers: Mapping[str, Offer] = dict(offers)
         self.directory = directory
-        self.any_directory = any_directory
         self.events = EventBoard()
         self.soonest = _NEVER
         """Never later than `due` (s): a shell whose timer is set for no later time need not ask for that."""
         self._keeping = keeping or Keeping()
-        self._links: dict[str, _Link] = {}
-        self._epochs: dict[str, int] = {}
+        self._peers = Peers(name, directory, any_directory, self._keeping.lease)
         self._running: dict[str, _Run] = {}
         self._results = ResultStore(self._keeping, self.events.forget_run)
-        self._leases: dict[str, str] = {}
         self._commands: dict[str, str] = {}
         self._timers: list[tuple[float, str, str]] = []
         self._orders: list[Order] = []
@@ -176,43 +116,21 @@ class Callee:
 
     def link_up(self, now: float, peer: str, hello: Hello, *, local: bool = True) -> Welcome | Refuse:
         """A caller has connected (`peer` is its name, `local` whether it lives on this host). Says what to answer it."""
-        refusal = self._refusal_of(peer, hello)
+        refusal = self._peers.refusal(peer, hello)
         if refusal is not None:
             return refusal
-        self._epochs[peer] = hello.epoch
-        self._links[peer] = _Link(hello.role, hello.boot, hello.epoch, local)
+        self._peers.come(peer, hello, local)
         self._messages.extend((peer, event) for event in self.events.waiting(peer))
         version = negotiate(hello.oldest_version, hello.newest_version) or NEWEST_VERSION
         offers = tuple(name for name, offer in self.offers.items() if local or offer.scope != "local")
         runs = [id_ for id_, run in self._running.items() if run.peer == peer] + self._results.of(peer)
         return Welcome(version, self.name, self.boot, offers, tuple(runs), self.directory)
 
-    def _refusal_of(self, peer: str, hello: Hello) -> Refuse | None:
-        if negotiate(hello.oldest_version, hello.newest_version) is None:
-            spoken = f"{OLDEST_VERSION} to {NEWEST_VERSION}"
-            asked = f"{hello.oldest_version} to {hello.newest_version}"
-            return Refuse("version", f"{self.name} speaks versions {spoken}, you {asked}: update the older side")
-        if hello.epoch < self._epochs.get(peer, 0):
-            known = self._epochs[peer]
-            text = f"{peer} has been here with epoch {known}, you come with {hello.epoch}: a newer one has taken over"
-            return Refuse("old_epoch", text)
-        link = self._links.get(peer)
-        if link is not None and link.up and link.boot != hello.boot and hello.epoch <= link.epoch:
-            return Refuse("name_taken", f"another process is connected as {peer}: stop it, or take another name")
-        if hello.directory and self.directory and hello.directory != self.directory and not self.any_directory:
-            text = f"your services.toml ({hello.directory[:12]}) is not {self.name}'s ({self.directory[:12]}): "
-            return Refuse("directory", text + "copy the same file to each host and start its node again")
-        return None
-
     def link_down(self, now: float, peer: str, *, leaves: bool = False) -> None:
         """The link of a caller is down; with `leaves` it said good-bye and gives up its leases and subscriptions."""
-        link = self._links.get(peer)
-        if link is None or not link.up:
+        if not self._peers.go(now, peer, leaves):
             return
-        link.up, link.down_at = False, now
         self.events.peer_down(peer, leaves)
-        if leaves:
-            self._leases = {device: holder for device, holder in self._leases.items() if holder != peer}
         for id_, run in self._running.items():
             if run.peer == peer and run.orphan_time is not None:
                 self._set_timer(now + run.orphan_time, "orphan", id_)
@@ -244,7 +162,7 @@ class Callee:
             self._messages.append((peer, Outcome(id_, ERROR, {}, "rebooted", text, Executed.UNKNOWN)))
             return
         offer = self.offers.get(call.service)
-        refusal = self._refusal_of_call(now, peer, call, offer)
+        refusal = self._peers.refusal_of_call(now, peer, call, offer, self._in_use)
         if refusal is not None or offer is None:
             cause, text = refusal or ("unknown_service", "")
             self._end(now, peer, Outcome(id_, ERROR, {}, cause, text, Executed.NO))
@@ -262,7 +180,9 @@ class Callee:
         id_ = call.id
         if offer is None or offer.inline is None or id_ in self._results or id_ in self._running:
             return None
-        if (call.boot and call.boot != self.boot) or self._refusal_of_call(now, peer, call, offer) is not None:
+        if (call.boot and call.boot != self.boot) or self._peers.refusal_of_call(
+            now, peer, call, offer, self._in_use
+        ) is not None:
             return None
         outcome = self._answered(now, offer.inline, call)
         self._results.add(now, peer, outcome)
@@ -289,37 +209,8 @@ class Callee:
             text = "its result was kept no longer"
             self._messages.append((peer, Outcome(id_, ERROR, {}, "forgotten", text, Executed.UNKNOWN)))
 
-    def _refusal_of_call(self, now: float, peer: str, call: Call, offer: Offer | None) -> tuple[str, str] | None:
-        """Why this call is not begun: cause and text, None if it is."""
-        link = self._links.get(peer)
-        if link is None or not link.up:
-            return "not_welcome", f"{peer} has not been welcomed by {self.name}"
-        if offer is None:
-            return (
-                "unknown_service",
-                f"{self.name} offers no {call.service}: services.toml places it elsewhere or nowhere",
-            )
-        if call.epoch < link.epoch and link.role == COORDINATOR:
-            return "old_epoch", f"{peer} is at epoch {link.epoch}, the call is of epoch {call.epoch}"
-        if offer.scope == "local" and not link.local:
-            return "local_only", f"{call.service} serves callers on the host of {self.name} alone"
-        return self._lease(now, peer, link, offer.device) if offer.device else None
-
-    def _lease(self, now: float, peer: str, link: _Link, device: str) -> tuple[str, str] | None:
-        """Give the caller the lease of the device, or say why not."""
-        if link.role == NODE:
-            return "device_needs_coordinator", f"{device} takes orders from a coordinator alone, not from node {peer}"
-        holder = self._leases.get(device, peer)
-        if holder != peer and not self._lease_is_free(now, holder, device):
-            return "device_leased", f"{device} takes orders from {holder}"
-        self._leases[device] = peer
-        return None
-
-    def _lease_is_free(self, now: float, holder: str, device: str) -> bool:
-        link = self._links.get(holder)
-        if link is not None and (link.up or now < link.down_at + self._keeping.lease):
-            return False
-        return not any(run.device == device for run in self._running.values())
+    def _in_use(self, device: str) -> bool:
+        return any(run.device == device for run in self._running.values())
 
     @staticmethod
     def _answered(now: float, inline: Inline, call: Call) -> Outcome:
@@ -354,9 +245,9 @@ class Callee:
             self._end(now, peer, Outcome(cancel.id, ERROR, {}, "cancelled", cancel.reason, Executed.NO))
 
     def _take_subscribe(self, now: float, peer: str, subscribe: Subscribe) -> None:
-        link = self._links.get(peer)
-        if link is not None:
-            waiting = self.events.subscribe(peer, subscribe.names, link.role == COORDINATOR)
+        known = self._peers.get(peer)
+        if known is not None:
+            waiting = self.events.subscribe(peer, subscribe.names, known.role == COORDINATOR)
             self._messages.extend((peer, event) for event in waiting)
 
     def _take_event_ack(self, now: float, peer: str, ack: EventAck) -> None:
@@ -467,10 +358,7 @@ class Callee:
         self._results.advance(now)
 
     def _is_orphan(self, run: _Run, now: float) -> bool:
-        link = self._links.get(run.peer)
-        if run.orphan_time is None or (link is not None and link.up):
-            return False
-        return link is None or now >= link.down_at + run.orphan_time
+        return run.orphan_time is not None and self._peers.is_away(now, run.peer, run.orphan_time)
 
     def due(self) -> float | None:
         """When `advance` has something to do next (s), None if never."""
@@ -496,8 +384,7 @@ class Callee:
         self._send(peer, outcome)
 
     def _send(self, peer: str, message: Message) -> None:
-        link = self._links.get(peer)
-        if link is None or link.up:
+        if self._peers.is_up(peer) or self._peers.get(peer) is None:
             self._messages.append((peer, message))
 
 
@@ -506,17 +393,6 @@ def _sendable(outcome: Outcome) -> Outcome:
     try:
         values = plain(outcome.values, "values") if outcome.values else outcome.values
     except NotPlainError as fault:
-        values, text = {}, f"what it returned cannot be sent: {fault}"
-        return Outcome(
-            outcome.id, ERROR, {}, "bad_result", text, outcome.executed, outcome.seconds, outcome.cpu_seconds
-        )
-    return Outcome(
-        outcome.id,
-        str(outcome.status),
-        values,
-        outcome.cause,
-        outcome.text,
-        outcome.executed,
-        outcome.seconds,
-        outcome.cpu_seconds,
-    )
+        text = f"what it returned cannot be sent: {fault}"
+        return replace(outcome, status=ERROR, values={}, cause="bad_result", text=text)
+    return replace(outcome, status=str(outcome.status), values=values)

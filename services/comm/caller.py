@@ -20,10 +20,8 @@ Used alike in real time (`client.py` drives it) and in lock step (its messages t
 
 from __future__ import annotations
 
-import heapq
-from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Final
 
 from services.comm.events import EventIntake
@@ -59,6 +57,7 @@ from services.comm.notice import (
 )
 from services.comm.plain import plain
 from services.comm.settled import Settled
+from services.comm.under_way import NEVER, Patience, Pending, UnderWay
 
 __all__ = [
     "Accepted",
@@ -75,36 +74,6 @@ __all__ = [
 ]
 
 ERROR: Final = "error"
-_NEVER: Final = float("inf")
-
-
-@dataclass(frozen=True, slots=True)
-class Patience:
-    """How long the caller waits (s)."""
-
-    reconnect: float = 2.0
-    """After a broken link, before its calls end."""
-    accept: float = 1.0
-    """For ACCEPT."""
-    stop: float = 5.0
-    """For RESULT after the deadline or a cancel: the node's stop routine and kill take time."""
-    answer: float = 2.0
-    """For the answer to a command."""
-    acknowledge: float = 0.05
-    """How long an acknowledgement waits for others to go with it."""
-
-
-@dataclass(slots=True)
-class _Pending:
-    call: Call
-    any_boot: bool
-    """Until it is sent, it may go to whatever boot the peer is."""
-    made: float
-    sent: bool = False
-    accepted: bool = False
-    cancel: str | None = None
-    accept_due: float = _NEVER
-    due: float = _NEVER
 
 
 class Caller:
@@ -120,18 +89,16 @@ class Caller:
         self.boot = ""
         """Boot of the peer, empty before the first link."""
         self.offers: tuple[str, ...] = ()
-        self.soonest = _NEVER
+        self.soonest = NEVER
         """Never later than `due` (s): a shell whose timer is set for no later time need not ask for that."""
         self._auto_ack = auto_ack
         self._patience = patience or Patience()
         self._refusal = ""
         self._held_until: float | None = None
-        self._pending: dict[str, _Pending] = {}
+        self._pending = UnderWay()
         self._commands: dict[str, float] = {}
         self._names: tuple[str, ...] | None = None
         self._events = EventIntake()
-        self._accepts: deque[tuple[float, str]] = deque()
-        self._deadlines: list[tuple[float, str]] = []
         self._settled = Settled(self._patience.acknowledge)
         self._messages: list[Message] = []
         self._notices: list[Notice] = []
@@ -142,12 +109,10 @@ class Caller:
             Event: self._take_event,
             Answer: self._take_answer,
             Welcome: self.link_up,
-            Refuse: self._take_refuse,
+            Refuse: self.link_refused,
             Bye: self._take_bye,
             Ping: self._take_ping,
         }
-
-    # What the owner asks for.
 
     def open(self, now: float) -> None:
         """Say HELLO (lock step; in real time the connection does it)."""
@@ -183,7 +148,7 @@ class Caller:
         if arguments:
             arguments = plain(arguments, "arguments")
         call = Call(id, service, arguments, deadline, epoch or self.hello.epoch, boot or self.boot, parent, seed)
-        pending = self._pending[id] = _Pending(call, not boot, now)
+        pending = self._pending[id] = Pending(call, not boot, now)
         if self.up:
             self._send(now, pending)
         elif self._refusal:
@@ -200,7 +165,7 @@ class Caller:
             self._end(id, "cancelled", reason, Executed.NO)
             return
         pending.cancel = reason
-        self._watch(pending, min(pending.due, now + self._patience.stop))
+        self._watch(pending, now + self._patience.stop)
         if self.up:
             self._messages.append(Cancel(id, reason))
 
@@ -238,8 +203,6 @@ class Caller:
     def under_way(self) -> tuple[str, ...]:
         """Ids of the calls that have not ended."""
         return tuple(self._pending)
-
-    # What happens to the link.
 
     def link_up(self, now: float, welcome: Welcome) -> None:
         """The peer welcomed us: what was under way is sent again under its id, or ends if this is another boot."""
@@ -299,8 +262,6 @@ class Caller:
             self._no_answer(id_, "refused")
         self._end_all("refused", self._refusal)
 
-    # What the peer says.
-
     def receive(self, now: float, message: Message) -> None:
         """Take a message of the peer; kinds that only a server is sent are left alone."""
         taker = self._takers.get(type(message))
@@ -328,7 +289,7 @@ class Caller:
             return
         pending.accepted = True
         self._notices.append(Accepted(accept.id))
-        if pending.call.deadline is not None and pending.cancel is None:
+        if pending.call.deadline is not None:
             self._watch(pending, pending.made + pending.call.deadline + self._patience.stop)
 
     def _take_feedback(self, now: float, feedback: Feedback) -> None:
@@ -346,59 +307,32 @@ class Caller:
         if self._commands.pop(answer.id, None) is not None:
             self._notices.append(Answered(answer))
 
-    def _take_refuse(self, now: float, refuse: Refuse) -> None:
-        self.link_refused(now, refuse)
-
     def _take_bye(self, now: float, bye: Bye) -> None:
         self.link_down(now, bye.text or "it left")
 
     def _take_ping(self, now: float, ping: Ping) -> None:
         self._messages.append(Pong(ping.number))
 
-    # What time does.
-
     def advance(self, now: float) -> None:
         """End what has waited too long."""
         if self._held_until is not None and now >= self._held_until:
             self._held_until = None
             self._end_all("lost", f"{self.peer} did not come back in {self._patience.reconnect:g} s")
-        while self._accepts and self._accepts[0][0] <= now:
-            self._accept_over(self._accepts.popleft())
-        while self._deadlines and self._deadlines[0][0] <= now:
-            due, id_ = heapq.heappop(self._deadlines)
-            pending = self._pending.get(id_)
-            if pending is not None and pending.due <= due:
-                self._give_up(id_, "no_answer", f"{self.peer} gave no result in time")
+        for id_ in self._pending.not_accepted(now):
+            if self.up:
+                self._give_up(id_, "not_accepted", f"{self.peer} did not accept it in {self._patience.accept:g} s")
+        for id_ in self._pending.not_answered(now):
+            self._give_up(id_, "no_answer", f"{self.peer} gave no result in time")
         for id_ in [id_ for id_, due in self._commands.items() if due <= now]:
             self._no_answer(id_, "no_answer")
 
-    def _accept_over(self, watch: tuple[float, str]) -> None:
-        due, id_ = watch
-        pending = self._pending.get(id_)
-        if pending is not None and not pending.accepted and self.up and pending.accept_due <= due:
-            self._give_up(id_, "not_accepted", f"{self.peer} did not accept it in {self._patience.accept:g} s")
-
     def due(self) -> float | None:
         """When `advance` has something to do next (s), None if never."""
-        while self._accepts and self._accepted_or_over(self._accepts[0][1]):
-            self._accepts.popleft()
-        while self._deadlines and self._deadlines[0][1] not in self._pending:
-            heapq.heappop(self._deadlines)
-        soonest = min(self._settled.due, min(self._commands.values(), default=_NEVER))
-        if self._accepts:
-            soonest = min(soonest, self._accepts[0][0])
-        if self._deadlines:
-            soonest = min(soonest, self._deadlines[0][0])
+        soonest = min(self._pending.due(), self._settled.due, min(self._commands.values(), default=NEVER))
         if self._held_until is not None:
             soonest = min(soonest, self._held_until)
         self.soonest = soonest
-        return soonest if soonest < _NEVER else None
-
-    def _accepted_or_over(self, id_: str) -> bool:
-        pending = self._pending.get(id_)
-        return pending is None or pending.accepted
-
-    # What goes out.
+        return soonest if soonest < NEVER else None
 
     def messages(self, now: float | None = None) -> list[Message]:
         """What to send, in order; each message is given once. Acknowledgements wait for others until `now` reaches theirs."""
@@ -417,21 +351,20 @@ class Caller:
         notices, self._notices = self._notices, []
         return notices
 
-    def _send(self, now: float, pending: _Pending) -> None:
+    def _send(self, now: float, pending: Pending) -> None:
         call = pending.call
         if pending.any_boot and call.boot != self.boot:
             call = pending.call = replace(call, boot=self.boot)
         pending.sent = True
         pending.accepted = False
-        due = pending.accept_due = now + self._patience.accept
-        self._accepts.append((due, call.id))
+        due = now + self._patience.accept
+        self._pending.watch_accept(pending, due)
         self._messages.append(call)
         if due < self.soonest:
             self.soonest = due
 
-    def _watch(self, pending: _Pending, due: float) -> None:
-        pending.due = due
-        heapq.heappush(self._deadlines, (due, pending.call.id))
+    def _watch(self, pending: Pending, due: float) -> None:
+        self._pending.watch_result(pending, due)
         self.soonest = min(self.soonest, due)
 
     def _ack(self, now: float, id_: str) -> None:

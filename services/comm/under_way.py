@@ -1,0 +1,92 @@
+"""Calls under way at their caller, and how long each may wait."""
+
+from __future__ import annotations
+
+import heapq
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+from services.comm.messages import Call
+
+NEVER: Final = float("inf")
+
+
+@dataclass(frozen=True, slots=True)
+class Patience:
+    """How long the caller waits (s)."""
+
+    reconnect: float = 2.0
+    """After a broken link, before its calls end."""
+    accept: float = 1.0
+    """For ACCEPT."""
+    stop: float = 5.0
+    """For RESULT after the deadline or a cancel: the node's stop routine and kill take time."""
+    answer: float = 2.0
+    """For the answer to a command."""
+    acknowledge: float = 0.05
+    """How long an acknowledgement waits for others to go with it."""
+
+
+@dataclass(slots=True)
+class Pending:
+    """A call that has not ended. `made` and the dues are on the caller's clock (s)."""
+
+    call: Call
+    any_boot: bool
+    """Until it is sent, it may go to whatever boot the peer is."""
+    made: float
+    sent: bool = False
+    accepted: bool = False
+    cancel: str | None = None
+    accept_due: float = NEVER
+    result_due: float = NEVER
+
+
+class UnderWay(dict[str, Pending]):
+    """Calls under way by id, with their watches: for ACCEPT a queue (all wait equally long), for RESULT a heap."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._accepts: deque[tuple[float, str]] = deque()
+        self._results: list[tuple[float, str]] = []
+
+    def watch_accept(self, pending: Pending, due: float) -> None:
+        """Wait for ACCEPT until `due`."""
+        pending.accept_due = due
+        self._accepts.append((due, pending.call.id))
+
+    def watch_result(self, pending: Pending, due: float) -> None:
+        """Wait for RESULT until `due`, or until an earlier time set before."""
+        if due < pending.result_due:
+            pending.result_due = due
+            heapq.heappush(self._results, (due, pending.call.id))
+
+    def not_accepted(self, now: float) -> Iterator[str]:
+        """Ids that have waited too long for ACCEPT."""
+        while self._accepts and self._accepts[0][0] <= now:
+            due, id_ = self._accepts.popleft()
+            pending = self.get(id_)
+            if pending is not None and not pending.accepted and pending.accept_due <= due:
+                yield id_
+
+    def not_answered(self, now: float) -> Iterator[str]:
+        """Ids that have waited too long for RESULT."""
+        while self._results and self._results[0][0] <= now:
+            _, id_ = heapq.heappop(self._results)
+            if id_ in self:
+                yield id_
+
+    def due(self) -> float:
+        """When the next watch is over (s)."""
+        while self._accepts and self._is_past(self._accepts[0][1]):
+            self._accepts.popleft()
+        while self._results and self._results[0][1] not in self:
+            heapq.heappop(self._results)
+        accept = self._accepts[0][0] if self._accepts else NEVER
+        return min(accept, self._results[0][0]) if self._results else accept
+
+    def _is_past(self, id_: str) -> bool:
+        pending = self.get(id_)
+        return pending is None or pending.accepted
