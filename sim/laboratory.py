@@ -17,7 +17,7 @@ from services.comm.channels import can_body, image_body, read_can, read_images_w
 from services.comm.directory import Directory
 from services.comm.messages import Call, Executed, Outcome
 from services.comm.party import TICK, Envelope
-from sim.camera import Picture
+from sim.camera import Picture, PinholeCamera
 from sim.drives import DriveBus
 from sim.exposures import Exposures, camera_of
 from sim.faults import Fault, FaultPlan, read_fault
@@ -30,7 +30,7 @@ from sim.thrower import Thrower
 from sim.truth import LaboratoryError, Truth
 from sim.world import World
 
-SERVICES = ("laboratory_prepare", "laboratory_score", "laboratory_fault")
+PREPARE, SCORE, FAULT = SERVICES = ("laboratory_prepare", "laboratory_score", "laboratory_fault")
 _NOISE, _FAULTS = 0x6361, 0x6661
 """Keep the draws of camera noise and of faults apart from other draws of the same seed."""
 
@@ -54,7 +54,9 @@ class Laboratory:
         self.name = name
         self._site = site
         self._where = where
-        offers = {service: Offer(inline=self._answer) for service in SERVICES}
+        self.now = 0.0
+        """How far the world has gone (s)."""
+        offers = {service: Offer(inline=lambda _, call: self.answer(call)) for service in SERVICES}
         self.callee = Callee(name, boot, offers, directory=directory)
         truth = site.truth(regime)
         self._mount = CupMount(site.arm, truth)
@@ -67,7 +69,7 @@ class Laboratory:
         self._bus_ports: list[str] = []
         self._out: list[Envelope] = []
         self._world: World | None = None
-        self._prepare(0.0, seed, truth, throws)
+        self._prepare(self.now, seed, truth, throws)
 
     def _prepare(self, now: float, seed: int, truth: Truth, throws: int | None) -> None:
         """A new experiment: ball gone, score empty, everything drawn anew. The arm stays where it is."""
@@ -100,11 +102,8 @@ class Laboratory:
             self.callee.receive(now, self._where(envelope.source), envelope.body)
 
     def advance(self, now: float) -> None:
-        """One tick: exposure of the world as it is at `now`, then on to `now` + TICK, then what leaves."""
-        self._begin_faults(now)
-        self._expose(now)
-        self._throw(now)
-        self._move(now)
+        """One tick, then what leaves."""
+        self.tick(now)
         self._send_frames()
         self._send_images(now)
         self.callee.advance(now)
@@ -115,6 +114,16 @@ class Laboratory:
         """What was sent since the last call, in order."""
         out, self._out = self._out, []
         return out
+
+    # What lock step and real time share
+
+    def tick(self, now: float) -> None:
+        """Exposure of the world as it is at `now`, then on to `now` + TICK."""
+        self._begin_faults(now)
+        self._expose(now)
+        self._throw(now)
+        self._move(now)
+        self.now = now + TICK
 
     # Bus
 
@@ -146,12 +155,20 @@ class Laboratory:
         ready = now + self.truth.settings["camera"]["readout"] + self.truth.image_latency
         self.exposures.put(now, ready, self._picture(now))
 
+    def draw_scene(self, regime: str) -> None:
+        """Draw the still scene of a regime's camera ahead of its first image. Raises LaboratoryError."""
+        _ = camera_of(self._site.cell, self._site.truth(regime), self._noise).background
+
+    def camera(self) -> PinholeCamera:
+        """The camera as it hangs in this regime, ready for the next image."""
+        return camera_of(self._site.cell, self.truth, self._noise)
+
     def _picture(self, now: float) -> Picture:
         ball, cup = self.world.ball, self._cup_now()
         ends, radii = self._solid_parts
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = cup.rotation(), cup.origin
-        return camera_of(self._site.cell, self.truth, self._noise).render(
+        return self.camera().render(
             None if ball is None else ball.position,
             (0.0, 0.0, 0.0) if ball is None else ball.velocity,
             ends,
@@ -239,32 +256,33 @@ class Laboratory:
         elif fault.kind == "slow_arm":
             self.bus.slow_down(fault.value)
 
-    def _answer(self, now: float, call: Call) -> Outcome:
+    def answer(self, call: Call) -> Outcome:
+        """Answer a call of one of `SERVICES`."""
         try:
-            values = self.serve(now, call.service, call.arguments)
+            values = self.serve(call.service, call.arguments)
         except (LaboratoryError, ValueError) as fault:
             return Outcome(call.id, "error", {}, "bad_arguments", str(fault), Executed.NO)
         return Outcome(call.id, "success", values)
 
-    def serve(self, now: float, service: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
+    def serve(self, service: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Answer one of `SERVICES`. Raises ValueError (LaboratoryError among them) for arguments that cannot be.
 
         laboratory_prepare(seed=0, regime="A", throws=None): a new experiment, gives nothing; other parameters of the task
         are not the laboratory's business; laboratory_score(cycles=[]): see sim.referee;
         laboratory_fault(kind, after=0, ...): see sim.faults.
         """
-        if service == "laboratory_score":
-            return self.referee.score(now, arguments.get("cycles", ()))
-        if service == "laboratory_fault":
+        if service == SCORE:
+            return self.referee.score(self.now, arguments.get("cycles", ()))
+        if service == FAULT:
             rest = {key: value for key, value in arguments.items() if key != "kind"}
-            self._faults.add(read_fault(now, str(arguments.get("kind", "")), rest))
+            self._faults.add(read_fault(self.now, str(arguments.get("kind", "")), rest))
             return {}
         seed, regime, throws = arguments.get("seed", 0), arguments.get("regime", "A"), arguments.get("throws")
         if type(seed) is not int or seed < 0:
             raise ValueError(f"seed is {seed!r}: give a whole number, 0 or more")
         if throws is not None and (type(throws) is not int or throws < 0):
             raise ValueError(f"throws is {throws!r}: give a whole number, 0 or more, or leave it out")
-        self._prepare(now, seed, self._site.truth(str(regime)), throws)
+        self._prepare(self.now, seed, self._site.truth(str(regime)), throws)
         return {}
 
     def close(self) -> None:

@@ -241,6 +241,12 @@ def bench(site: Site) -> Iterator[Callable[..., Bench]]:
         one.lab.close()
 
 
+@pytest.fixture
+def cell_master(site: Site) -> Callable[[], Master]:
+    """Makes masters for the shipped arm at home."""
+    return lambda: Master(site.arm, site.arm.poses["home"].tolist())
+
+
 def run_digests(seed: int, regime: str, prepared_before: bool = False) -> list[str]:
     """Digests of the score, of all images and of the arm's end position after two throws."""
     made = Bench(read_site(CELL_FILE), seed=77 if prepared_before else seed, regime="A" if prepared_before else regime)

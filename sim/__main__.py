@@ -1,0 +1,82 @@
+"""Launches the simulated laboratory: `python -m sim [--services FILE] [--lockstep]`."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from services.comm.directory import Directory, DirectoryError, load
+from services.comm.lockstep import CellError, Delays, Member
+from services.comm.security import KeyFileError, KeyNeededError, read_key
+from sim.laboratory import make_laboratory
+from sim.realtime import serve
+from sim.truth import LaboratoryError
+
+EXAMPLE = "example:\n  python -m sim --services services.toml"
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    commands = argparse.ArgumentParser(
+        prog="python -m sim",
+        description="Launches the simulated laboratory: the node of services.toml that says sim = true.",
+        epilog=f"{EXAMPLE}\n\nexit codes: 0 ended by SIGTERM, 2 bad services.toml or cell file, 3 the cell lost a party",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands.add_argument("--services", metavar="FILE", type=Path, default=Path("services.toml"), help="location file")
+    commands.add_argument("--lockstep", action="store_true", help="be a member of a lock-step cell")
+    return commands
+
+
+def read(path: Path) -> tuple[Directory, str]:
+    """The location file and the name of its simulated node. Raises DirectoryError."""
+    try:
+        directory = load(path)
+    except OSError as fault:
+        raise DirectoryError((f"{path}: {fault.strerror}; name the file with --services",)) from fault
+    name = directory.laboratory()
+    if not name:
+        raise DirectoryError((f"{path}: no node is simulated; write sim = true in one [nodes.NAME]",))
+    return directory, name
+
+
+def run_lockstep(directory: Directory, name: str) -> None:
+    """Be a member of a lock-step cell of one process a node, until one of them ends it."""
+    laboratory = make_laboratory(directory, name)
+    key = read_key(directory.file(directory.keys["file"])) if "file" in directory.keys else None
+    delays = Delays(directory.delays())
+    member = Member(name, [laboratory], directory.members(), delays=delays, directory=directory.hash, key=key)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    print(f"node {name} ready for lock step, process {os.getpid()}", flush=True)
+    try:
+        member.open()
+        member.run()
+    finally:
+        laboratory.close()
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the laboratory; gives the exit code."""
+    options = parser().parse_args(arguments)
+    try:
+        directory, name = read(options.services)
+        if options.lockstep:
+            run_lockstep(directory, name)
+        else:
+            asyncio.run(serve(directory, name))
+    except (DirectoryError, LaboratoryError, KeyNeededError, KeyFileError, ValueError, OSError) as fault:
+        print(f"python -m sim: {fault}", file=sys.stderr)
+        return 2
+    except CellError as fault:
+        print(f"python -m sim: {fault}", file=sys.stderr)
+        return 3
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,231 @@
+"""The laboratory on the wall clock: bus, camera and calls over sockets, the world paced by absolute deadlines.
+
+A thread paces the world: it waits in the bus's sockets until the next deadline, answers frames as they come, and at each
+deadline moves the world on to it, so the world is never ahead of the clock. Calls are served by an asyncio loop in the main
+thread; both hold one lock while they touch the laboratory.
+
+Catch-up: a tick that begins late is followed at once by the next ones until the world has caught up. A world more than
+`SLIP` behind (a stopped process, a machine out of breath) does not run after the clock: its time slips, and `slipped` says
+by how much in all.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import gc
+import os
+import secrets
+import signal
+import threading
+import time
+from typing import Final
+
+from services.comm.callee import Callee, Offer, Order, StartRun
+from services.comm.camera import ImageServer
+from services.comm.can_hub import Hub
+from services.comm.directory import Directory
+from services.comm.messages import Call, Outcome
+from services.comm.party import TICK
+from services.comm.security import read_key
+from services.comm.server import Server
+from sim.laboratory import PREPARE, SERVICES, Laboratory
+from sim.site import site_of
+from sim.truth import LaboratoryError
+
+SLIP: Final = 0.1
+"""s behind the clock from which on the world's time slips."""
+
+
+class Pacemaker:
+    """Moves a laboratory along with the clock and carries frames and images. `run` until `stop`, in a thread of its own."""
+
+    def __init__(self, laboratory: Laboratory, hub: Hub | None, images: ImageServer | None) -> None:
+        """`hub`: the arm's bus, `images`: the camera's end of the wire; None where the cell has none."""
+        self.lock = threading.Lock()
+        self.slipped = 0.0
+        """s by which the world has fallen behind the clock for good."""
+        self._laboratory = laboratory
+        self._hub = hub
+        self._port = hub.port() if hub else None
+        self._images = images
+        self._generation = 0
+        self._stopped = threading.Event()
+        self._begin = 0.0
+
+    def stop(self) -> None:
+        """Let `run` end."""
+        self._stopped.set()
+
+    def run(self) -> None:
+        """Go on until stopped."""
+        self._begin = time.monotonic() - self._laboratory.now
+        while not self._stopped.is_set():
+            late = time.monotonic() - self._begin - self._laboratory.now - TICK
+            if late > SLIP:
+                self._begin += late
+                self.slipped += late
+            self._wait(self._begin + self._laboratory.now + TICK)
+            with self.lock:
+                self._laboratory.tick(self._laboratory.now)
+                self._send_frames()
+            self._serve_camera()
+
+    def _wait(self, deadline: float) -> None:
+        """Until the deadline, answering what comes from the bus."""
+        while True:
+            left = deadline - time.monotonic()
+            if self._hub is None or self._port is None:
+                if left > 0.0:
+                    self._stopped.wait(left)
+                return
+            self._hub.poll(max(left, 0.0))
+            frames = self._port.receive()
+            if frames:
+                with self.lock:
+                    self._laboratory.receive_frames(self._laboratory.now, "bus", frames)
+                    self._send_frames()
+            if left <= 0.0:
+                return
+
+    def _send_frames(self) -> None:
+        if self._port is not None:
+            for frame in self._laboratory.take_frames():
+                self._port.send(frame)
+
+    def _serve_camera(self) -> None:
+        if self._images is None:
+            return
+        self._images.poll()
+        exposures = self._laboratory.exposures
+        with self.lock:
+            if self._images.rate != exposures.rate:
+                self._generation += 1
+                exposures.want(self._laboratory.now, self._images.rate, self._generation)
+            gone = exposures.take(self._laboratory.now)
+        for image in gone:
+            self._images.send(image.pixels, time.monotonic() - self._begin - image.time)
+
+
+class LaboratoryShell:
+    """A running laboratory of one simulated node of services.toml. Between `start` and `close` it serves."""
+
+    def __init__(self, directory: Directory, name: str) -> None:
+        """Raises LaboratoryError, ValueError for an address that cannot be, OSError for one that is taken."""
+        self._directory = directory
+        self._name = name
+        self.laboratory = Laboratory(name, site_of(directory), directory.party)
+        channel, address = bus_channel(directory), camera_address(directory)
+        self._hub = Hub(channel) if channel else None
+        self._images = ImageServer(*address) if address else None
+        self.pacemaker = Pacemaker(self.laboratory, self._hub, self._images)
+        offers = {service: Offer(inline=None if service == PREPARE else self._answer) for service in SERVICES}
+        callee = Callee(name, secrets.token_hex(8), offers, directory=directory.hash)
+        key = read_key(directory.file(directory.keys["file"])) if "file" in directory.keys else None
+        self.server = Server(callee, on_orders=self._obey, key=key)
+        self._preparing: set[asyncio.Task[None]] = set()
+        self._thread = threading.Thread(target=self._pace, name="pacemaker", daemon=True)
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self.over = asyncio.Event()
+        """Set when the pacemaker has ended by a fault; `close` raises that."""
+        self._fault: BaseException | None = None
+
+    async def start(self) -> None:
+        """Draw the still scene, start the world's clock, then listen. Raises OSError, KeyNeededError."""
+        if self._images is not None:
+            self.laboratory.draw_scene("A")
+        gc.collect()
+        gc.freeze()  # what is here stays: the collector need not look at it in mid-tick
+        self._loop = asyncio.get_running_loop()
+        self._thread.start()
+        try:
+            await self.server.start(*self._directory.address(self._name))
+        except BaseException:
+            await self.close()
+            raise
+
+    async def close(self) -> None:
+        """End in good order. Raises what ended the pacemaker."""
+        self.pacemaker.stop()
+        await asyncio.to_thread(self._thread.join)
+        await asyncio.gather(*self._preparing)
+        await self.server.close("the laboratory stops")
+        if self._hub is not None:
+            self._hub.close()
+        if self._images is not None:
+            self._images.close()
+        self.laboratory.close()
+        if self._fault is not None:
+            raise self._fault
+
+    def _pace(self) -> None:
+        try:
+            self.pacemaker.run()
+        except BaseException as fault:
+            self._fault = fault
+            if self._loop is not None:
+                self._loop.call_soon_threadsafe(self.over.set)
+
+    def _answer(self, now: float, call: Call) -> Outcome:
+        with self.pacemaker.lock:
+            return self.laboratory.answer(call)
+
+    def _obey(self, now: float, orders: list[Order]) -> None:
+        """Preparations alone are runs; they cannot be stopped, only waited for."""
+        for order in orders:
+            if isinstance(order, StartRun):
+                task = asyncio.get_running_loop().create_task(self._prepare(order.call))
+                self._preparing.add(task)
+                task.add_done_callback(self._preparing.discard)
+
+    async def _prepare(self, call: Call) -> None:
+        """A regime in which the camera hangs elsewhere needs seconds to draw its still scene: not in the loop, not in a tick."""
+        with contextlib.suppress(LaboratoryError):  # the answer says what is wrong with the regime
+            await asyncio.to_thread(self.laboratory.draw_scene, str(call.arguments.get("regime", "A")))
+        outcome = self._answer(self.server.now(), call)
+        self.server.callee.finish(
+            self.server.now(), call.id, outcome.status, outcome.values, outcome.cause, outcome.text, outcome.executed
+        )
+        self.server.flush()
+
+
+def bus_channel(directory: Directory) -> str:
+    """Channel of the simulated bus: that of the device that speaks `petrobot_stream`; empty without one."""
+    channels = set()
+    for device in directory.devices.values():
+        can = device.config.get("can") or device.config
+        if can.get("interface") == "petrobot_stream":
+            channels.add(str(can.get("channel", "")))
+    if len(channels) > 1:
+        raise LaboratoryError(
+            f"{directory.source}: buses {', '.join(sorted(channels))}: the laboratory has one; use one"
+        )
+    return channels.pop() if channels else ""
+
+
+def camera_address(directory: Directory) -> tuple[str, int] | None:
+    """Where the simulated camera listens: the `address` of the device with `source = "sim"`; None without one."""
+    addresses = {
+        str(d.config.get("address", "")) for d in directory.devices.values() if d.config.get("source") == "sim"
+    }
+    if not addresses:
+        return None
+    if len(addresses) > 1:
+        raise LaboratoryError(f"{directory.source}: cameras at {', '.join(sorted(addresses))}: the laboratory has one")
+    host, _, port = addresses.pop().rpartition(":")
+    if not host or not port.isdigit():
+        raise LaboratoryError(f'{directory.source}: a device with source = "sim" needs address = "host:port"')
+    return host, int(port)
+
+
+async def serve(directory: Directory, name: str) -> None:
+    """Run the laboratory until SIGTERM or SIGINT; prints one line with `ready` when it serves."""
+    shell = LaboratoryShell(directory, name)
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, shell.over.set)
+    await shell.start()
+    host, port = shell.server.address
+    print(f"node {name} ready on {host}:{port}, process {os.getpid()}", flush=True)
+    await shell.over.wait()
+    await shell.close()

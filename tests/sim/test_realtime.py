@@ -1,0 +1,288 @@
+"""The laboratory on the wall clock, over its sockets; and as a process of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from services.comm.caller import Caller
+from services.comm.camera import StreamImages
+from services.comm.can_ports import StreamPort
+from services.comm.cell import Delays
+from services.comm.client import Client
+from services.comm.directory import load
+from services.comm.lockstep import Member
+from services.comm.messages import Call, Hello, Outcome
+from services.comm.party import TICK, Envelope
+from sim.realtime import LaboratoryShell, bus_channel, camera_address
+from sim.truth import LaboratoryError
+
+REPOSITORY = Path(__file__).parents[2]
+NUMBERS = itertools.count(1)
+PATIENCE = 60.0
+"""s of wall time within which what must come has come, on a machine out of breath."""
+
+
+def free_ports(count: int) -> list[int]:
+    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
+    ports = [one.getsockname()[1] for one in sockets]
+    for one in sockets:
+        one.close()
+    return ports
+
+
+def services_file(folder: Path, extra: str = "") -> Path:
+    node, bus, camera, coordinator = free_ports(4)
+    text = f"""\
+schema = 1
+[nodes.laboratory]
+host = "127.0.0.1"
+port = {node}
+sim = true
+[nodes.robot]
+host = "127.0.0.1"
+port = {coordinator}
+[devices.arm]
+node = "robot"
+driver = "nowhere:Arm"
+interface = "petrobot_stream"
+channel = "tcp://127.0.0.1:{bus}"
+[devices.eye]
+node = "robot"
+driver = "nowhere:Eye"
+source = "sim"
+address = "127.0.0.1:{camera}"
+[services.laboratory_prepare]
+node = "laboratory"
+[services.laboratory_score]
+node = "laboratory"
+[services.laboratory_fault]
+node = "laboratory"
+[parameters]
+cell = "{REPOSITORY / "services" / "cell.toml"}"
+{extra}"""
+    file = folder / "services.toml"
+    file.write_text(text)
+    return file
+
+
+async def until(holds: Callable[[], bool]) -> None:
+    """Look every 2 ms whether it holds."""
+    pause = threading.Event()
+    async with asyncio.timeout(PATIENCE):
+        while not holds():
+            await asyncio.to_thread(pause.wait, 0.002)
+
+
+@pytest.fixture
+async def shell(tmp_path: Path) -> AsyncIterator[LaboratoryShell]:
+    running = LaboratoryShell(load(services_file(tmp_path)), "laboratory")
+    await running.start()
+    yield running
+    await running.close()
+
+
+async def call(shell: LaboratoryShell, service: str, **arguments: Any) -> Outcome:
+    # a name of its own for each: a caller of one name and boot numbers its calls from 1
+    caller = Caller("laboratory", Hello(1, 99, "client", f"test {next(NUMBERS)}", "boot"))
+    host, port = shell.server.address
+    client = Client(host, port, caller, on_notices=lambda now, notices: None)
+    client.start()
+    try:
+        async with asyncio.timeout(PATIENCE):
+            return await client.call(service, arguments, deadline=PATIENCE)
+    finally:
+        await client.close()
+
+
+async def test_world_keeps_pace_with_the_clock(shell: LaboratoryShell) -> None:
+    lab, pacemaker = shell.laboratory, shell.pacemaker
+    loop = asyncio.get_running_loop()
+    began, world, slipped = loop.time(), lab.now, pacemaker.slipped
+    await until(lambda: lab.now - world > 0.5)
+    took = loop.time() - began - (pacemaker.slipped - slipped)
+    assert lab.now - world < took + 2 * TICK  # never ahead of the clock
+    assert took - (lab.now - world) < 0.3
+
+
+async def test_drives_answer_on_the_bus(shell: LaboratoryShell, cell_master: Callable[[], Any]) -> None:
+    port = StreamPort(bus_channel(shell._directory))
+    master = cell_master()
+    lab = shell.laboratory
+    last = [0.0]
+
+    def exchange() -> bool:
+        if lab.now > last[0]:
+            last[0] = lab.now
+            for frame in master.frames(lab.now):
+                port.send(frame)
+        master.take(port.receive())
+        return bool(master.enabled)
+
+    await until(exchange)
+    assert master.position == pytest.approx(lab.plant.q, abs=1e-3)
+    port.close()
+
+
+async def test_images_come_with_their_age_and_stop_when_asked(shell: LaboratoryShell) -> None:
+    address = camera_address(shell._directory)
+    assert address is not None
+    loop = asyncio.get_running_loop()
+    camera = StreamImages(*address, loop.time)
+    camera.start(25.0)
+    images: list[Any] = []
+
+    def look() -> bool:
+        image = camera.newest()
+        if image is not None:
+            images.append((loop.time(), image))
+        return len(images) >= 6
+
+    await until(look)
+    assert all(0.007 < arrived - image.time < 5.0 for arrived, image in images)
+    assert np.diff([image.sequence for _, image in images]).min() >= 1
+    assert images[0][1].pixels.shape == (480, 640)
+    camera.stop()
+    await until(lambda: camera.newest() is None and shell.laboratory.exposures.rate == 0.0)
+    camera.close()
+
+
+async def test_services_are_answered(shell: LaboratoryShell) -> None:
+    assert (await call(shell, "laboratory_prepare", seed=7, regime="B+miscalibrated", runs=3)).status == "success"
+    score = await call(shell, "laboratory_score")
+    assert (score.values["seed"], score.values["regime"], score.values["throws"]) == (7, "B+miscalibrated", [])
+    assert (await call(shell, "laboratory_fault", kind="slow_arm", factor=0.5)).status == "success"
+    refused = await call(shell, "laboratory_prepare", regime="Q")
+    assert refused.status == "error" and "must begin with" in refused.text
+
+
+async def test_a_fault_of_the_world_ends_the_shell(tmp_path: Path) -> None:
+    running = LaboratoryShell(load(services_file(tmp_path)), "laboratory")
+
+    def fails(now: float) -> None:
+        raise RuntimeError("the world came to its end")
+
+    running.laboratory.tick = fails  # type: ignore[method-assign]
+    await running.start()
+    async with asyncio.timeout(PATIENCE):
+        await running.over.wait()
+    with pytest.raises(RuntimeError, match="came to its end"):
+        await running.close()
+
+
+@pytest.mark.parametrize(
+    ("extra", "says"),
+    [
+        (
+            '[devices.other]\nnode = "robot"\ndriver = "no:Where"\ninterface = "petrobot_stream"\nchannel = "tcp://x:1"',
+            "bus",
+        ),
+        ('[devices.other]\nnode = "robot"\ndriver = "no:Where"\nsource = "sim"\naddress = "127.0.0.1:1"', "cameras"),
+    ],
+)
+def test_two_buses_or_cameras_are_one_too_many(tmp_path: Path, extra: str, says: str) -> None:
+    directory = load(services_file(tmp_path, extra))
+    with pytest.raises(LaboratoryError, match=says):
+        LaboratoryShell(directory, "laboratory")
+
+
+# Processes
+
+
+def program(*arguments: str) -> subprocess.Popen[str]:
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    return subprocess.Popen(
+        [sys.executable, "-m", "sim", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+        cwd=REPOSITORY,
+    )
+
+
+@pytest.mark.processes
+def test_the_process_says_ready_and_ends_on_sigterm(tmp_path: Path) -> None:
+    process = program("--services", str(services_file(tmp_path)))
+    assert process.stdout is not None
+    try:
+        assert any("ready" in line for line in iter(process.stdout.readline, ""))
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(PATIENCE) == 0
+    finally:
+        process.kill()
+        process.communicate()
+
+
+class Looker:
+    """A party that asks for the score and ends the cell when it has it."""
+
+    name = "coordinator"
+
+    def __init__(self) -> None:
+        self.score: dict[str, Any] = {}
+        self._out = [Hello(1, 99, "coordinator", "coordinator", "boot"), Call("1", "laboratory_score")]
+
+    def receive(self, now: float, envelope: Envelope) -> None:
+        if isinstance(envelope.body, Outcome):
+            self.score = dict(envelope.body.values)
+
+    def advance(self, now: float) -> None:
+        pass
+
+    def drain(self) -> list[Envelope]:
+        out, self._out = self._out, []
+        return [Envelope("laboratory", self.name, "laboratory", "call", body) for body in out]
+
+
+@pytest.mark.processes
+def test_it_is_a_member_of_a_lock_step_cell(tmp_path: Path) -> None:
+    extra = f'[coordinator]\nhost = "127.0.0.1"\nport = {free_ports(1)[0]}'
+    text = services_file(tmp_path, extra).read_text()
+    lone = text[: text.index("[nodes.robot]")] + text[text.index("[services.laboratory_prepare]") :]
+    file = tmp_path / "lone.toml"
+    file.write_text(lone)
+    directory = load(file)
+    process = program("--services", str(file), "--lockstep")
+    looker = Looker()
+    member = Member(
+        "coordinator", [looker], directory.members(), delays=Delays({}), directory=directory.hash, patience=PATIENCE
+    )
+    try:
+        member.open()
+        member.run(lambda: bool(looker.score), 1000)
+        assert looker.score["regime"] == "A"
+        assert process.wait(PATIENCE) == 0
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (None, "name the file with --services"),
+        ("schema = 1\n[nodes.l]\nhost = '127.0.0.1'\nport = 7999\n", "write sim = true"),
+        ("schema = 1\n[nodes.l]\nhost = '127.0.0.1'\nport = 7999\nsim = true\n", "[parameters] cell is missing"),
+    ],
+)
+def test_a_bad_location_file_is_one_clear_error(tmp_path: Path, text: str | None, says: str) -> None:
+    file = tmp_path / "services.toml"
+    if text is not None:
+        file.write_text(text)
+    process = program("--services", str(file))
+    _, errors = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 2 and says in errors and "Traceback" not in errors
