@@ -18,6 +18,7 @@ import ipaddress
 import select
 import socket
 import struct
+import threading
 import time
 from collections import deque
 from typing import Any, Final
@@ -121,6 +122,7 @@ class Line:
         sock.setblocking(False)
         self.sock = sock
         self._splitter = Splitter()
+        self._lock = threading.Lock()  # python-can users receive in one thread and send in another
         self._waiting = bytearray(GREETING)
         self.flush()
 
@@ -131,13 +133,18 @@ class Line:
 
     def write(self, data: bytes) -> None:
         """Send, or keep what the kernel does not take. Raises ConnectionError if the other end is gone or does not read."""
-        self._waiting += data
-        self.flush()
+        with self._lock:
+            self._waiting += data
+            self._flush()
         if len(self._waiting) > BACKLOG:
             raise ConnectionError("the other end of the CAN stream does not read")
 
     def flush(self) -> None:
         """Send what waits, as far as the kernel takes it."""
+        with self._lock:
+            self._flush()
+
+    def _flush(self) -> None:
         while self._waiting:
             try:
                 sent = self.sock.send(self._waiting)

@@ -1,0 +1,214 @@
+"""Independent check by the `canopen` package: it masters our drives, and our master runs drives made of it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from importlib.resources import files
+from typing import Any
+
+import can
+import canopen
+import pytest
+from canopen.profiles.p402 import BaseNode402
+
+from services.comm.can_hub import Hub
+from services.comm.canbus import Frame
+from services.comm.canopen import NmtState
+from services.comm.cia402 import Command, Fault, Object, State, command_of, from_units
+from services.motion.drive_master import DriveMaster, DriveSettings, Phase
+from sim.drives import DriveBus, ratings
+
+EDS = str(files("services.comm.eds").joinpath("puma_drive.eds"))
+INPUTS_EDS = str(files("services.comm.eds").joinpath("cell_inputs.eds"))
+PATIENCE = 10.0
+
+
+class LiveDrives:
+    """Our drives on a hub, kept going by a thread; simulated time goes on with the wall's."""
+
+    def __init__(self, plant: Any, table: Any) -> None:
+        self.hub = Hub()
+        self.channel = self.hub.channel
+        self.drives = DriveBus(plant, ratings(table))
+        self._port = self.hub.port()
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._live)
+        self._thread.start()
+
+    def _live(self) -> None:
+        start, done = time.monotonic(), 0.0
+        while not self._over.is_set():
+            self.hub.poll(0.001)
+            now = time.monotonic() - start
+            for frame in self._port.receive():
+                self.drives.receive(now, frame)
+            while done < now:
+                self.drives.step(done, 0.001)
+                done += 0.001
+            for frame in self.drives.drain():
+                self._port.send(frame)
+        self.hub.close()
+
+    def close(self) -> None:
+        self._over.set()
+        self._thread.join()
+
+
+@pytest.fixture
+def live(make_plant: Callable[[], Any], table: Any) -> Iterator[LiveDrives]:
+    drives = LiveDrives(make_plant(), table)
+    yield drives
+    drives.close()
+
+
+@pytest.fixture
+def network(live: LiveDrives) -> Iterator[canopen.Network]:
+    network = canopen.Network()
+    network.connect(interface="petrobot_stream", channel=live.channel)
+    yield network
+    for node in network.values():
+        node.rpdo[1].stop()
+    network.sync.stop()
+    network.disconnect()
+
+
+def _until(condition: Callable[[], bool], what: str) -> None:
+    deadline = time.monotonic() + PATIENCE
+    pause = threading.Event()
+    while not condition():
+        assert time.monotonic() < deadline, what
+        pause.wait(0.005)
+
+
+def test_the_canopen_package_masters_our_drive(live: LiveDrives, network: canopen.Network) -> None:
+    node = BaseNode402(1, EDS)
+    network.add_node(node)
+    node.sdo.RESPONSE_TIMEOUT = 2.0
+    assert node.sdo[0x1000].raw == 0x00020192
+    assert node.sdo[0x6502].raw == 1 << 7
+    node.sdo[0x60C2][1].raw = 10
+    node.nmt.state = "PRE-OPERATIONAL"
+    node.rpdo[1].clear()
+    node.rpdo[1].add_variable(0x6040)
+    node.rpdo[1].add_variable(0x607A)
+    node.rpdo[1].cob_id, node.rpdo[1].trans_type, node.rpdo[1].enabled = 0x201, 1, True
+    node.tpdo[1].clear()
+    node.tpdo[1].add_variable(0x6041)
+    node.tpdo[1].add_variable(0x6064)
+    node.tpdo[1].cob_id, node.tpdo[1].trans_type, node.tpdo[1].enabled = 0x181, 1, True
+    node.rpdo.save()
+    node.tpdo.save()
+    node.setup_402_state_machine(read_pdos=False)
+    node.sdo[0x6060].raw = 8
+    network.sync.start(0.01)
+    node.nmt.state = "OPERATIONAL"
+    _until(lambda: node.tpdo[1].timestamp is not None, "no TPDO came")
+    target = node.sdo[0x6064].raw
+    node.rpdo[1][0x607A].raw = target
+    node.rpdo[1].start(0.01)
+    for state in ("READY TO SWITCH ON", "SWITCHED ON", "OPERATION ENABLED"):
+        node.state = state
+        _until(lambda state=state: node.state == state, f"never {state}")
+    for step in range(40):
+        target += 2000
+        node.rpdo[1][0x607A].raw = target
+        node.rpdo[1].update()
+        seen = node.tpdo[1].timestamp
+        _until(lambda seen=seen: node.tpdo[1].timestamp != seen, f"no TPDO in step {step}")
+    _until(lambda: abs(node.tpdo[1][0x6064].raw - target) < 2000, "the set point was not reached")
+    assert live.drives.plant.q[0] == pytest.approx(from_units(target), abs=2e-3)
+    with pytest.raises(canopen.SdoAbortedError) as refused:
+        node.sdo[0x6060].raw = 1
+    assert refused.value.code in (0x06090030, 0x08000022)
+    live.drives.trip(0, Fault.OVERHEATED)
+    _until(lambda: bool(node.emcy.log), "no EMCY came")
+    assert node.emcy.log[0].code == Fault.OVERHEATED
+
+
+class ForeignDrive:
+    """A drive whose protocol is the `canopen` package's LocalNode; the state machine is written here from the standard."""
+
+    WORDS: dict[State, int] = {  # noqa: RUF012
+        State.SWITCH_ON_DISABLED: 0x0250,
+        State.READY_TO_SWITCH_ON: 0x0231,
+        State.SWITCHED_ON: 0x0233,
+        State.OPERATION_ENABLED: 0x1237,
+    }
+    NEXT: dict[tuple[State, Command | None], State] = {  # noqa: RUF012
+        (State.SWITCH_ON_DISABLED, Command.SHUTDOWN): State.READY_TO_SWITCH_ON,
+        (State.READY_TO_SWITCH_ON, Command.SWITCH_ON): State.SWITCHED_ON,
+        (State.SWITCHED_ON, Command.ENABLE_OPERATION): State.OPERATION_ENABLED,
+        (State.OPERATION_ENABLED, Command.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,
+    }
+
+    def __init__(self, network: canopen.Network, number: int) -> None:
+        self.node = network.create_node(number, EDS)
+        self.state = State.SWITCH_ON_DISABLED
+        self.position = 1000 * number
+        self.node.sdo[0x607F].raw = 2_000_000
+        network.subscribe(0x200 + number, self._received)
+        network.subscribe(0x080, self._sync)
+        self.node.nmt.send_command(0)
+        self._target = self.position
+
+    def _received(self, cob_id: int, data: bytearray, timestamp: float) -> None:
+        command = command_of(data[0] | data[1] << 8)
+        self.state = self.NEXT.get((self.state, command), self.state)
+        self._target = int.from_bytes(data[2:6], "little", signed=True)
+
+    def _sync(self, cob_id: int, data: bytearray, timestamp: float) -> None:
+        if self.node.nmt.state != "OPERATIONAL" or self.node.sdo[0x1800][1].raw & 0x80000000:
+            return
+        if self.state is State.OPERATION_ENABLED:
+            self.position = self._target
+        sent = (
+            self.WORDS[self.state].to_bytes(2, "little") + self.position.to_bytes(4, "little", signed=True) + bytes(2)
+        )
+        self.node.network.send_message(self.node.sdo[0x1800][1].raw & 0x7FF, sent)
+
+
+def test_our_master_runs_drives_of_the_canopen_package() -> None:
+    channel = "test_our_master_runs_foreign_drives"
+    network = canopen.Network()
+    network.connect(interface="virtual", channel=channel)
+    bus = can.Bus(interface="virtual", channel=channel)
+    drives = [ForeignDrive(network, number) for number in range(1, 7)]
+    network.create_node(7, INPUTS_EDS)
+    master = DriveMaster([DriveSettings(-3.0, 3.0, 10.0)] * 6, 0.004)
+    targets = [0.001 * number for number in range(1, 7)]
+    start = time.monotonic()
+    pause = threading.Event()
+    try:
+        moved = 0
+        while moved < 50:
+            now = time.monotonic() - start
+            assert now < PATIENCE, (master.phase, master.troubles, [drive.state for drive in master.drives])
+            while (message := bus.recv(timeout=0.0)) is not None:
+                master.receive(now, Frame(message.arbitration_id, bytes(message.data)))
+            if master.enabled:
+                moved += 1
+                targets = [target + 0.001 for target in targets]
+            elif master.phase is Phase.RUNNING:
+                targets = master.positions
+            for frame in master.advance(now, targets):
+                bus.send(can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False))
+            pause.wait(0.004)
+        assert not master.troubles
+        for drive, target in zip(drives, targets, strict=True):
+            assert drive.state is State.OPERATION_ENABLED
+            assert from_units(drive.position) == pytest.approx(target, abs=0.0101)
+            dictionary = drive.node.sdo
+            assert dictionary[0x6060].raw == 8
+            assert dictionary[0x1016][1].raw == 0x007F00C8
+            assert dictionary[0x1A00][0].raw == 3
+            assert dictionary[Object.FOLLOWING_ERROR_WINDOW].raw == 100_000
+            assert master.drives[0].max_speed == 2.0
+            assert drive.node.nmt.state == "OPERATIONAL"
+        assert NmtState.OPERATIONAL == 5
+    finally:
+        for drive in drives:
+            drive.node.nmt.stop_heartbeat()
+        network.disconnect()
+        bus.shutdown()
