@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -62,15 +63,16 @@ def loads(text: str, source: str = "task") -> Task:
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise TaskFileError(source, [Fault("TOML", str(error), "see toml.io for the syntax")], [0]) from error
+        line = int(found[1]) if (found := re.search(r"at line (\d+)", str(error))) else 0
+        raise TaskFileError(source, [Fault("TOML", str(error), "see toml.io for the syntax")], [line]) from error
     except RecursionError as error:
         raise TaskFileError(source, [Fault("TOML", "nested too deeply", "flatten it")], [0]) from error
     faults: list[Fault] = []
     task = _task(Table(data, "", faults))
-    found = faults or list(task_faults(task))
-    if found:
+    faults = faults or list(task_faults(task))
+    if faults:
         lines = key_lines(text)
-        raise TaskFileError(source, found, [line_of(f.key, lines) for f in found])
+        raise TaskFileError(source, faults, [line_of(f.key, lines) for f in faults])
     return task
 
 

@@ -1,0 +1,213 @@
+"""Findings of the check, each by a small broken task and by the same task mended."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from coordinator.check import Severity, check
+from coordinator.conditions import parse
+from coordinator.task import Task
+
+Tasks = Callable[..., Task]
+A = {"n": {"in": "a:normal", "out": "y"}, "e": {"in": "a:error", "out": "y"}}
+E, W, N = Severity.ERROR, Severity.WARNING, Severity.NOTE
+
+
+def found(task: Task, **kwargs: Any) -> dict[str, Any]:
+    """Findings by code."""
+    return {f.code: f for f in check(task, **kwargs).findings}
+
+
+def test_sound_task_has_no_finding(task: Tasks) -> None:
+    report = check(task("a!=1 y", A, final="y == 1"), {"do_a": "node"})
+    assert report.findings == () and report.ok
+
+
+@pytest.mark.parametrize(
+    ("code", "severity", "key", "broken"),
+    [
+        ("no-normal-exit", E, "places.a", lambda t: t("a!=1 y", {"e": A["e"]})),
+        ("no-error-exit", E, "places.a", lambda t: t("a!=1 y", {"n": A["n"]})),
+        (
+            "uncovered-exit",
+            E,
+            "places.a",
+            lambda t: t("a!=1 y", {**A, "n": {"in": "a:normal", "when": "k > 1"}}, variables={"k": 0}),
+        ),
+        (
+            "uncovered-exit",
+            E,
+            "places.a",
+            lambda t: t("a!=1 y", {**A, "n": {"in": "a:normal", "when": "a.status == 'success'"}}),
+        ),
+        (
+            "unsettled-conflict",
+            E,
+            "transitions.t",
+            lambda t: t("x=1 y", {"t": {"in": "x", "out": "y", "event": "e"}, "u": {"in": "x", "event": "e"}}, "e"),
+        ),
+        (
+            "unsettled-conflict",
+            E,
+            "transitions.n",
+            lambda t: t("a!=1 y", {**A, "m": {"in": "a:normal", "event": "e"}}, "e*"),
+        ),
+        (
+            "unsettled-conflict",
+            E,
+            "transitions.t",
+            lambda t: t("x=1 w=1", {"t": {"in": "x", "event": "e"}, "u": {"in": "w", "event": "e"}}, "e*"),
+        ),
+        (
+            "arrival-order",
+            N,
+            "transitions.t",
+            lambda t: t("x=1", {"t": {"in": "x", "event": "e"}, "u": {"in": "x", "event": "f"}}, "e f*"),
+        ),
+        (
+            "arrival-order",
+            N,
+            "transitions.t",
+            lambda t: t("x=1", {"t": {"in": "x", "event": "e"}, "u": {"in": "x", "after": 1.0}}, "e"),
+        ),
+        (
+            "timeless-cycle",
+            E,
+            "transitions.t",
+            lambda t: t("x=1 y", {"t": {"in": "x", "out": "y"}, "u": {"in": "y", "out": "x"}}),
+        ),
+        ("timeless-cycle", E, "transitions.t", lambda t: t("y", {"t": {"out": "y"}})),
+        ("external-wait", W, "places.x", lambda t: t("x=1", {"t": {"in": "x", "event": "e"}}, "e")),
+        (
+            "external-wait",
+            W,
+            "places.a",
+            lambda t: t("a!=1", {"n": {"in": "a:normal", "event": "e"}, "e": {"in": "a:error"}}, "e*"),
+        ),
+        ("never-marked", W, "places.r", lambda t: t("r~ y", {"t": {"in": "r", "out": "y"}})),
+        ("never-marked", N, "places.x", lambda t: t("x y", {"t": {"in": "x", "out": "y"}})),
+        ("never-fires", W, "transitions.t", lambda t: t("r~ y", {"t": {"in": "r", "out": "y"}})),
+        ("final-at-start", W, "task.final", lambda t: t("x y", {"t": {"in": "x", "out": "y"}}, final="x == 0")),
+        ("unused", N, "events.e", lambda t: t("a!=1 y", A, "e")),
+        (
+            "never-written",
+            W,
+            "variables.k",
+            lambda t: t("x=1", {"t": {"in": "x", "when": "k == none"}}, variables={"k": None}),
+        ),
+        (
+            "event-unheard",
+            E,
+            "transitions.t.event",
+            lambda t: t("a!=1 x=1 y", {**A, "t": {"in": "x", "event": "seen"}}, "seen<a"),
+        ),
+        (
+            "internal-impossible",
+            E,
+            "transitions.start.event",
+            lambda t: t("x=1 a! y", {**A, "start": {"in": "x", "out": "a", "event": "tick"}}, "tick<a"),
+        ),
+        ("inconsistent", E, "transitions.t.in", lambda t: t("x=1", {"t": {"in": "w"}})),
+        ("inconsistent", E, "transitions.t.event", lambda t: t("x=1", {"t": {"in": "x", "event": "odd"}})),
+        ("inconsistent", E, "transitions.t.event", lambda t: t("x=1", {"t": {"in": "x", "event": "e f"}}, "e f")),
+    ],
+)
+def test_finding(task: Tasks, code: str, severity: Severity, key: str, broken: Callable[[Tasks], Task]) -> None:
+    report = check(broken(task))
+    keys = {(f.code, f.severity, f.key) for f in report.findings}
+    assert (code, severity, key) in keys, str(report)
+    assert report.ok is (severity is not E)
+
+
+def test_refused_internal_tick_says_why(task: Tasks) -> None:
+    broken = task("x=1 a! y", {**A, "start": {"in": "x", "out": "a", "event": "tick"}}, "tick<a")
+    assert "operator could no longer control" in found(broken)["internal-impossible"].text
+
+
+@pytest.mark.parametrize(
+    "mended",
+    [
+        {"t": {"when": "k > 1"}, "u": {"when": "k <= 1"}},
+        {"t": {"priority": 1}, "u": {}},
+        {"t": {"weight": 1.0}, "u": {"weight": 2.0}},
+    ],
+    ids=["conditions", "priority", "weight"],
+)
+def test_what_settles_a_conflict(task: Tasks, mended: dict[str, dict[str, Any]]) -> None:
+    net = {n: {"in": "x", "event": "e", **mended[n]} for n in ("t", "u")}
+    assert "unsettled-conflict" not in found(task("x=1", net, "e", {"k": 0}))
+
+
+def test_conditions_that_overlap_give_a_witness(task: Tasks) -> None:
+    net = {"t": {"in": "x", "event": "e", "when": "k > 1"}, "u": {"in": "x", "event": "e", "when": "k < 4"}}
+    witness = found(task("x=1", net, "e", {"k": 0}))["unsettled-conflict"].witness
+    assert 1 < witness["k"] < 4
+
+
+def test_uncovered_exit_gives_a_witness(task: Tasks) -> None:
+    net = {**A, "n": {"in": "a:normal", "when": "k > 1"}, "m": {"in": "a:normal", "when": "k < 0"}}
+    assert 0 <= found(task("a!=1 y", net, variables={"k": 0}))["uncovered-exit"].witness["k"] <= 1
+
+
+@pytest.mark.parametrize(
+    "net",
+    [
+        {"t": {"in": "x !y"}, "u": {"in": "x y"}},
+        {"t": {"in": "a:normal x"}, "u": {"in": "a:error x"}},
+        {"t": {"in": "a:normal x"}, "u": {"in": "a:preempt=none x", "event": "e"}},
+    ],
+    ids=["inhibitor", "status", "end and preemption"],
+)
+def test_tokens_that_exclude_each_other_are_no_conflict(task: Tasks, net: dict[str, dict[str, Any]]) -> None:
+    codes = found(task("x=1 y=1 a!=1", net, "e"))
+    assert "unsettled-conflict" not in codes and "arrival-order" not in codes
+
+
+def test_invariant_that_excludes_two_transitions(task: Tasks) -> None:
+    net = {
+        "swap": {"in": "p", "out": "q", "event": "f"},
+        "back": {"in": "q", "out": "p", "event": "f"},
+        "t": {"in": "p r", "out": "p", "event": "e"},
+        "u": {"in": "q r", "out": "q", "event": "e"},
+    }
+    pairs = [f.text for f in check(task("p~=1 q~ r~=1", net, "e f")).findings if f.code == "unsettled-conflict"]
+    assert pairs == []
+    pairs = [f.text for f in check(task("p~=1 q~=1 r~=1", net, "e f")).findings if f.code == "unsettled-conflict"]
+    assert any(t.startswith("t and u") for t in pairs), "with two tokens they can meet"
+    pairs = [f.text for f in check(task("p=1 q r~=1", net, "e f")).findings if f.code == "unsettled-conflict"]
+    assert any(t.startswith("t and u") for t in pairs), "the operator may add the second one"
+
+
+def test_counting_loop_is_no_timeless_cycle(task: Tasks) -> None:
+    net = {"t": {"in": "x k", "out": "x"}, "u": {"in": "x !k", "out": "y"}}
+    assert "timeless-cycle" not in found(task("x=1 k=3 y", net))
+
+
+def test_after_beside_an_external_wait(task: Tasks) -> None:
+    net = {"t": {"in": "x", "event": "e"}, "late": {"in": "x", "after": 9.0}}
+    assert "external-wait" not in found(task("x=1", net, "e"))
+
+
+def test_events_wait_for_themselves_cover_all_cases(task: Tasks) -> None:
+    net = {
+        **A,
+        "n": {"in": "a:normal", "event": "e", "when": "k > 1"},
+        "late": {"in": "a:normal", "after": 3.0, "priority": 1},
+    }
+    assert "uncovered-exit" not in found(task("a!=1 y", net, "e*", {"k": 0}))
+
+
+def test_action_that_no_node_offers(task: Tasks) -> None:
+    made = task("a!=1 y", A, alternatives={"a": ("look_once", "look_twice")})
+    finding = found(made, offers={"look_once": "vision", "look_twise": "vision"})["unoffered"]
+    assert "'look_twice'" in finding.text and "did you mean 'look_twise'" in finding.text
+    assert "unoffered" not in found(made, offers={"look_once": "vision", "look_twice": "vision"})
+    assert "unoffered" not in found(made)
+
+
+def test_honest_end_at_start(task: Tasks) -> None:
+    made = task("x=1 y", {"t": {"in": "x", "out": "y", "event": "e"}}, "e", final="y == 1", final_error=parse("x == 1"))
+    assert found(made)["final-at-start"].key == "task.final_error"
