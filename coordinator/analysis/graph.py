@@ -1,0 +1,182 @@
+"""Directed graphs in compact arrays: reachability, strong components, bottom components, almost sure attraction.
+
+Used on reachability graphs; knows nothing of nets. Small graphs need no scipy, so that a quick check starts quickly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+Mask = NDArray[np.bool_]
+Index = NDArray[np.int64]
+
+SMALL = 20_000
+"""Edges below which plain Python finds strong components sooner than scipy is imported."""
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Vertices 0 to n - 1; edge e goes from source[e] to target[e], edges sorted by source."""
+
+    n: int
+    source: NDArray[np.int32]
+    target: NDArray[np.int32]
+
+    @cached_property
+    def row(self) -> Index:
+        """First edge of each vertex, shape (n + 1,)."""
+        return np.searchsorted(self.source, np.arange(self.n + 1)).astype(np.int64)
+
+    @cached_property
+    def _into(self) -> tuple[Index, Index]:
+        """Edges by target: (first of each vertex, edge numbers)."""
+        order = np.argsort(self.target, kind="stable")
+        return np.searchsorted(self.target[order], np.arange(self.n + 1)).astype(np.int64), order
+
+    def forward(self, seeds: Mask | Sequence[int], edges: Mask | None = None) -> Mask:
+        """Vertices that can be reached from the seeds (seeds included) along the given edges (all by default)."""
+        return self._spread(seeds, edges, self.row, None, self.target)
+
+    def backward(self, seeds: Mask | Sequence[int], edges: Mask | None = None) -> Mask:
+        """Vertices from which a seed can be reached (seeds included) along the given edges (all by default)."""
+        return self._spread(seeds, edges, *self._into, self.source)
+
+    def _spread(
+        self, seeds: Mask | Sequence[int], edges: Mask | None, row: Index, order: Index | None, far: NDArray[np.int32]
+    ) -> Mask:
+        reached = np.zeros(self.n, dtype=np.bool_)
+        reached[seeds] = True
+        front = np.flatnonzero(reached)
+        while len(front):
+            at = _ranges(row[front], row[front + 1])
+            at = at if order is None else order[at]
+            if edges is not None:
+                at = at[edges[at]]
+            near = far[at]
+            front = np.unique(near[~reached[near]])
+            reached[front] = True
+        return reached
+
+    def path(self, start: int, goals: Mask, edges: Mask | None = None) -> list[int] | None:
+        """Edges of a shortest path from a vertex to any goal along the given edges; None if there is none."""
+        came = np.full(self.n, -2, dtype=np.int64)
+        came[start] = -1
+        front = np.array([start])
+        while len(front) and not goals[front].any():
+            at = _ranges(self.row[front], self.row[front + 1])
+            at = at if edges is None else at[edges[at]]
+            at = at[came[self.target[at]] == -2]
+            came[self.target[at[::-1]]] = at[::-1]
+            front = np.unique(self.target[at])
+        hits = front[goals[front]]
+        if not len(hits):
+            return None
+        path, vertex = [], int(hits[0])
+        while came[vertex] >= 0:
+            path.append(int(came[vertex]))
+            vertex = int(self.source[came[vertex]])
+        return path[::-1]
+
+    @cached_property
+    def components(self) -> NDArray[np.int32]:
+        """Number of the strong component of each vertex, shape (n,); numbers from 0, in no order to rely on."""
+        if len(self.target) + self.n <= SMALL:
+            return _tarjan(self.n, self.row.tolist(), self.target.tolist())
+        from scipy.sparse import csr_array
+        from scipy.sparse.csgraph import connected_components
+
+        ones = np.ones(len(self.target), dtype=np.int8)
+        matrix = csr_array((ones, self.target, self.row), shape=(self.n, self.n))
+        labels: NDArray[np.int32] = connected_components(matrix, directed=True, connection="strong")[1]
+        return labels
+
+    @cached_property
+    def bottom(self) -> Mask:
+        """Which components no edge leaves, shape (components,)."""
+        ours, theirs = self.components[self.source], self.components[self.target]
+        bottom = np.ones(int(self.components.max()) + 1, dtype=np.bool_)
+        bottom[ours[ours != theirs]] = False
+        return bottom
+
+    @cached_property
+    def inner(self) -> Mask:
+        """Which edges stay inside a strong component: exactly those on a cycle, shape (edges,)."""
+        inside: Mask = self.components[self.source] == self.components[self.target]
+        return inside
+
+    def almost_sure(self, goal: Mask, free: Mask, *, allowed: Mask | None = None, hits: Mask | None = None) -> Mask:
+        """Vertices from which a strategy reaches `goal`, or takes an edge of `hits`, with probability 1.
+
+        The strategy may leave out any edge that is `free`; every other edge has positive probability whenever its source
+        is visited (fairness). Before the goal only `allowed` vertices may be visited. The largest set that no other edge
+        leaves and inside which the goal stays reachable (greatest fixed point, as for Markov decision processes).
+        """
+        hits = np.zeros(len(self.target), dtype=np.bool_) if hits is None else hits
+        winning = goal.copy() if allowed is None else goal | allowed
+        if allowed is None:
+            winning[:] = True
+        forced = ~free & ~hits
+        while True:
+            leaves = forced & winning[self.source] & ~goal[self.source] & ~winning[self.target]
+            if leaves.any():
+                winning[self.source[leaves]] = False
+                continue
+            start = goal & winning
+            start[self.source[hits & winning[self.source]]] = True
+            inside = winning[self.source] & winning[self.target]
+            reaching = self.backward(start, inside)
+            if np.array_equal(reaching & winning, winning):
+                return winning
+            winning &= reaching
+
+
+def _ranges(first: Index, last: Index) -> Index:
+    """All numbers of the half-open ranges one after the other."""
+    length = last - first
+    total = int(length.sum())
+    if not total:
+        return np.zeros(0, dtype=np.int64)
+    begin = np.repeat(first - np.concatenate(([0], np.cumsum(length)[:-1])), length)
+    return begin + np.arange(total)
+
+
+def _tarjan(n: int, row: list[int], target: list[int]) -> NDArray[np.int32]:
+    """Strong components by Tarjan's algorithm without recursion."""
+    found, low, label = [-1] * n, [0] * n, [-1] * n
+    at, stack, count, components = row[:n], list[int](), 0, 0
+    for root in range(n):
+        if found[root] >= 0:
+            continue
+        path = [root]
+        found[root] = low[root] = count
+        count += 1
+        stack.append(root)
+        while path:
+            v = path[-1]
+            if at[v] < row[v + 1]:
+                w = target[at[v]]
+                at[v] += 1
+                if found[w] < 0:
+                    found[w] = low[w] = count
+                    count += 1
+                    stack.append(w)
+                    path.append(w)
+                elif label[w] < 0:
+                    low[v] = min(low[v], found[w])
+                continue
+            path.pop()
+            if path:
+                low[path[-1]] = min(low[path[-1]], low[v])
+            if low[v] == found[v]:
+                while True:
+                    w = stack.pop()
+                    label[w] = components
+                    if w == v:
+                        break
+                components += 1
+    return np.array(label, dtype=np.int32)

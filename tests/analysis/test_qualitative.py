@@ -1,0 +1,200 @@
+"""Verdicts against their definitions, by brute force on random nets, and witnesses against the net itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from coordinator.analysis.graph import Graph, _tarjan
+from coordinator.analysis.qualitative import Qualitative, examine
+from coordinator.analysis.space import Limits, explore
+from coordinator.analysis.stubborn import hunt_deadlock
+from coordinator.net import Marking, Net
+from tests.analysis.generators import kanban, philosophers
+from tests.analysis.random_nets import brute_force, nets, state_machines
+
+Reached = tuple[list[Marking], list[tuple[int, int, int]]]
+
+
+def closure(found: Reached) -> np.ndarray:
+    """reach[i, j]: marking j can be reached from marking i (zero steps included)."""
+    n = len(found[0])
+    reach = np.eye(n, dtype=bool)
+    for i, _, j in found[1]:
+        reach[i, j] = True
+    for k in range(n):
+        reach |= np.outer(reach[:, k], reach[k])
+    return reach
+
+
+def judge(net: Net, found: Reached, final: Callable[[Marking], bool]) -> dict[str, object]:
+    """Every verdict straight from its definition."""
+    markings, edges = found
+    reach = closure(found)
+    n, m = len(markings), len(net.transitions)
+    can = np.zeros((n, m), dtype=bool)
+    again = np.zeros(m, dtype=bool)
+    for i, t, j in edges:
+        can[:, t] |= reach[:, i]
+        again[t] |= reach[j, i]
+    levels = tuple(4 if can[:, t].all() else 3 if again[t] else 1 if can[0, t] else 0 for t in range(m))
+    busy = {i for i, _, _ in edges}
+    ends = np.array([final(x) for x in markings])
+    return {
+        "bounds": tuple(map(max, zip(*markings, strict=True))),
+        "dead": sum(i not in busy and not ends[i] for i in range(n)),
+        "levels": levels,
+        "live": all(level == 4 for level in levels),
+        "quasi_live": 0 not in levels,
+        "reversible": bool(reach[:, 0].all()),
+        "home": int(reach.all(axis=0).sum()),
+        "sound": bool((reach[:, ends].any(axis=1)).all() and not any(i in busy for i in range(n) if ends[i]) and 0 not in levels),
+    }  # fmt: skip
+
+
+def told(result: Qualitative) -> dict[str, object]:
+    assert result.sound is not None
+    return {
+        "bounds": result.bounds,
+        "dead": result.dead_markings,
+        "levels": result.levels,
+        "live": result.live.holds,
+        "quasi_live": result.quasi_live.holds,
+        "reversible": result.reversible.holds,
+        "home": result.home_states,
+        "sound": result.sound.holds,
+    }
+
+
+def check_witnesses(net: Net, result: Qualitative) -> None:
+    """Every witness replays in the net and ends where it says."""
+    verdicts = [result.bounded, result.safe, result.deadlock_free, result.quasi_live, result.live, result.reversible]
+    shown = [v.witness for v in verdicts if v.witness] + [d.witness for d in result.deadlocks]
+    for one in shown:
+        last = list(net.replay(one.firings))[-1]
+        assert {p: k for p, k in zip(net.places, last, strict=True) if k} == one.marking
+        list(net.replay(one.loop * 2, last))
+
+
+def empty_or_first(marking: Marking) -> bool:
+    return sum(marking) == marking[0]
+
+
+@settings(max_examples=120, deadline=None)
+@given(st.one_of(nets(), state_machines()))
+def test_verdicts_are_those_of_the_definitions(net: Net) -> None:
+    found = brute_force(net, 60)
+    assume(found is not None)
+    assert found is not None
+    result = examine(explore(net), final=empty_or_first)
+    assert told(result) == judge(net, found, empty_or_first)
+    check_witnesses(net, result)
+    assert sum(d.count for d in result.deadlocks) == result.dead_markings
+
+
+@settings(max_examples=80, deadline=None)
+@given(nets(places=4, transitions=4), st.integers(5, 40))
+def test_a_partial_search_never_says_what_the_whole_one_denies(net: Net, states: int) -> None:
+    part = examine(explore(net, limits=Limits(states=states)))
+    check_witnesses(net, part)
+    found = brute_force(net, 120)
+    assume(found is not None)
+    assert found is not None
+    whole = told(examine(explore(net), final=lambda _: False))
+    assert part.bounded.holds is not False
+    for name, verdict in (("live", part.live), ("quasi_live", part.quasi_live), ("reversible", part.reversible)):
+        assert verdict.holds in (None, whole[name]), name
+    assert part.deadlock_free.holds in (None, whole["dead"] == 0)
+    assert part.safe.holds in (None, max(whole["bounds"]) <= 1)  # type: ignore[call-overload]
+
+
+@settings(max_examples=120, deadline=None)
+@given(nets(), st.booleans())
+def test_stubborn_sets_find_a_deadlock_exactly_when_there_is_one(net: Net, with_final: bool) -> None:
+    found = brute_force(net, 150)
+    assume(found is not None)
+    assert found is not None
+    final = empty_or_first if with_final else None
+    busy = {i for i, _, _ in found[1]}
+    dead = {m for i, m in enumerate(found[0]) if i not in busy and not (final and final(m))}
+    hunt = hunt_deadlock(net, final=final)
+    assert hunt.complete and (hunt.firings is not None) == bool(dead)
+    if hunt.firings is not None:
+        assert list(net.replay(hunt.firings))[-1] in dead
+
+
+def test_stubborn_sets_need_few_markings() -> None:
+    hunt = hunt_deadlock(philosophers(10))
+    assert hunt.firings is not None and hunt.states < 3**10 / 50
+    assert hunt_deadlock(kanban(3)).firings is None and not hunt_deadlock(kanban(3), effort=20).complete
+
+
+def test_deadlocks_of_the_philosophers_are_grouped_with_their_emptied_siphon() -> None:
+    result = examine(explore(philosophers(4)))
+    assert result.deadlock_free.holds is False and result.dead_markings == 2
+    assert {d.marked for d in result.deadlocks} == {
+        tuple(p for p in philosophers(4).places if p.startswith(side)) for side in ("hasleft", "hasright")
+    }
+    for d in result.deadlocks:
+        assert len(d.witness.firings) == 4 and {"fork0", "fork1", "fork2", "fork3"} <= set(d.emptied)
+
+
+def test_kanban_is_live_reversible_and_bounded() -> None:
+    result = examine(explore(kanban(2)))
+    assert [v.holds for v in (result.bounded, result.safe, result.live, result.reversible, result.deadlock_free)] == [
+        True, False, True, True, True,
+    ]  # fmt: skip
+    assert result.home_states == 4600 and set(result.levels) == {4} and result.dead_transitions == ()
+
+
+def test_an_unbounded_net_gets_a_pump_and_unknowns() -> None:
+    net = Net.build({"p": 1, "q": 0}, {"grow": ({"p": 1}, {"p": 1, "q": 1}), "drop": ({"q": 1}, {})})
+    result = examine(explore(net, limits=Limits(states=100)))
+    assert result.bounded.holds is False and result.bounded.witness is not None
+    assert result.bounded.witness.loop == ("grow",) and result.bounds == (1, None)
+    assert result.live.holds is None and result.home_states is None and result.quasi_live.holds is True
+
+
+def test_a_partial_search_of_a_bounded_net_still_proves_it_bounded() -> None:
+    result = examine(explore(kanban(3), limits=Limits(states=500)))
+    assert result.bounded.holds is True and result.bounds == (3,) * 16
+    assert result.live.holds is None and not result.live.complete
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 12), st.lists(st.tuples(st.integers(0, 11), st.integers(0, 11)), max_size=30), st.data())
+def test_graph_primitives(n: int, pairs: list[tuple[int, int]], data: st.DataObject) -> None:
+    pairs = sorted((a % n, b % n) for a, b in pairs)
+    source, target = (np.array([p[k] for p in pairs], dtype=np.int32) for k in (0, 1))
+    graph = Graph(n, source, target)
+    reach = np.eye(n, dtype=bool)
+    for a, b in pairs:
+        reach[a, b] = True
+    for k in range(n):
+        reach |= np.outer(reach[:, k], reach[k])
+    labels = graph.components
+    assert np.array_equal(labels[:, None] == labels[None, :], reach & reach.T)
+    assert np.array_equal(graph.forward([0]), reach[0]) and np.array_equal(graph.backward([0]), reach[:, 0])
+    goal = data.draw(st.integers(0, n - 1))
+    path = graph.path(0, np.arange(n) == goal)
+    assert (path is not None) == reach[0, goal]
+    if path:
+        assert source[path[0]] == 0 and target[path[-1]] == goal
+        assert all(target[a] == source[b] for a, b in pairwise(path))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_scipy_and_plain_components_agree(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    n, m = 3000, 20_000
+    source = np.sort(random.integers(0, n, m)).astype(np.int32)
+    target = np.minimum(n - 1, np.maximum(0, source + random.integers(-2, 40, m))).astype(np.int32)
+    graph = Graph(n, source, target)
+    ours = _tarjan(n, graph.row.tolist(), target.tolist())
+    assert len(np.unique(ours)) > 1
+    assert len(np.unique(np.stack([ours, graph.components]), axis=1).T) == len(np.unique(ours))
