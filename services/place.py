@@ -9,7 +9,7 @@ from typing import Any, Protocol
 from services.comm.directory import ActionEntry
 from services.device import Driver
 from services.remote import CyclicDriver, DeviceCommand, DirectDevice, RemoteDriver
-from services.runner import Runner
+from services.runner import DeviceControl, Runner
 from services.runs import Hold, Order, Report, Stop, Told
 
 SLACK = 1e-6  # s: binary fractions of a period must not cost a whole tick
@@ -49,7 +49,7 @@ class InlinePlace:
         *,
         clock: Callable[[], float],
         driver: Driver | None = None,
-        remote: RemoteDriver | None = None,
+        remote: DeviceControl | None = None,
         streams: Mapping[str, float] | None = None,
         substitutes: Mapping[str, Callable[..., Any]] | None = None,
         virtual: bool = False,
@@ -57,14 +57,16 @@ class InlinePlace:
         self._actions = actions
         self._driver = driver
         self._cyclic = CyclicDriver(driver) if driver is not None and driver.period else None
-        self._remote = remote or RemoteDriver(self._post, clock)
+        self._remote = RemoteDriver(self._post, clock)
+        if self._cyclic is not None:
+            self._remote.take(self._cyclic.state())
         self._commands: list[DeviceCommand] = []
         self._next_step: float | None = None
         self._told: list[Report] = []
         self._runner = Runner(
             actions,
             clock=clock,
-            device=self._remote if remote or self._cyclic else driver and DirectDevice(driver),
+            device=remote or (self._remote if self._cyclic else driver and DirectDevice(driver)),
             streams=streams,
             substitutes=substitutes,
             virtual=virtual,

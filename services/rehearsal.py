@@ -1,0 +1,141 @@
+"""Tries an action out on a simulated clock, without node, device or network: for the tests of whoever writes actions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from services.action import Result, Status, error
+from services.comm.directory import MEMORY_CALLS, ActionEntry
+from services.comm.party import TICK
+from services.memory import Memory
+from services.place import InlinePlace
+from services.runs import Answered, Asked, Begin, Ended, Progressed, Raised, Report, Sent, Stop
+
+NAME, RUN = "action", "rehearsal"
+
+
+class StillRunningError(AssertionError):
+    """The action had not ended after the rehearsal's limit."""
+
+
+@dataclass
+class Rehearsal:
+    """What an action did: its result, and all that it told the world, with the simulated time since its begin (s)."""
+
+    result: Result
+    seconds: float
+    published: list[tuple[float, str, tuple[float, ...]]] = field(default_factory=list)
+    """Set points as a receiver gets them: (time, stream, values)."""
+    events: list[tuple[float, str, Mapping[str, Any]]] = field(default_factory=list)
+    progress: list[tuple[float, float]] = field(default_factory=list)
+    """(time, fraction)."""
+    calls: list[tuple[float, str, Mapping[str, Any]]] = field(default_factory=list)
+    """Calls of services: (time, service, arguments)."""
+    memory: Memory = field(default_factory=lambda: Memory(lambda name, value, version: None))
+
+
+def rehearse(
+    action: Callable[..., Any],
+    /,
+    *,
+    device: Any = None,
+    services: Mapping[str, Callable[..., Result]] | None = None,
+    streams: Mapping[str, float] | None = None,
+    world: Callable[[float], None] | None = None,
+    cancel_after: float | None = None,
+    limit: float = 60.0,
+    seed: int = 0,
+    **arguments: Any,
+) -> Rehearsal:
+    """Run an action to its end in ticks of 4 ms of simulated time; takes milliseconds of real time.
+
+    `device` is a driver (`services.device.Driver`; a cyclic one is stepped), or whatever the action uses as `ctx.device`.
+    `services` answer its calls by name (the global memory is there anyway), `streams` gives the periods of those it
+    publishes to (s). `world(now)` is called each tick before the action, to let something happen. With `cancel_after` it is
+    cancelled then. Raises StillRunningError when it has not ended after `limit` seconds.
+    """
+    stage = _Stage(action, device, services or {}, streams or {})
+    stage.place.take(0.0, Begin(RUN, NAME, arguments, None, seed))
+    for tick in range(round(limit / TICK) + 1):
+        stage.now = tick * TICK
+        if world is not None:
+            world(stage.now)
+        if cancel_after is not None and stage.now >= cancel_after - 1e-9:
+            stage.place.take(stage.now, Stop(RUN))
+            cancel_after = None
+        if stage.step():
+            return stage.played
+    raise StillRunningError(f"the action has not ended after {limit:g} s; it has told: {stage.played}")
+
+
+class _Prop:
+    """Any object as the device of a rehearsal; it counts as standing still."""
+
+    def __init__(self, handle: Any) -> None:
+        self.handle = handle
+
+    def stop(self, now: float) -> None:
+        """Nothing to stop."""
+
+    def stopped(self) -> bool:
+        """It never moves."""
+        return True
+
+
+class _Stage:
+    """A place for one run, with services around it."""
+
+    def __init__(
+        self,
+        action: Callable[..., Any],
+        device: Any,
+        services: Mapping[str, Callable[..., Result]],
+        streams: Mapping[str, float],
+    ) -> None:
+        self.now = 0.0
+        self.played = Rehearsal(error("still_running"), 0.0)
+        self._services = services
+        driver = device if hasattr(device, "stopped") and hasattr(device, "period") else None
+        self.place = InlinePlace(
+            {NAME: ActionEntry(NAME, "", "", "")},
+            clock=lambda: self.now,
+            driver=driver,
+            remote=_Prop(device) if driver is None and device is not None else None,
+            streams=streams,
+            substitutes={NAME: action},
+            virtual=True,
+        )
+
+    def step(self) -> bool:
+        """One tick; whether the run has ended."""
+        self.place.advance(self.now)
+        reports = self.place.reports()
+        for report in reports:
+            self._note(report)
+        return any(isinstance(report, Ended) for report in reports)
+
+    def _note(self, report: Report) -> None:
+        played = self.played
+        if isinstance(report, Ended):
+            played.result = Result(Status(report.status), report.values, report.cause, report.text)
+            played.seconds = report.seconds
+        elif isinstance(report, Sent):
+            played.published.append((self.now, report.stream, report.values))
+        elif isinstance(report, Raised):
+            played.events.append((self.now, report.name, report.data))
+        elif isinstance(report, Progressed):
+            played.progress.append((self.now, report.fraction))
+        elif isinstance(report, Asked):
+            played.calls.append((self.now, report.service, report.arguments))
+            result = self._answer(report)
+            answer = Answered(report.id, result.status, result.values, result.cause, result.text)
+            self.place.take(self.now, answer)
+
+    def _answer(self, asked: Asked) -> Result:
+        if asked.service in self._services:
+            return self._services[asked.service](**asked.arguments)
+        if asked.service in MEMORY_CALLS:
+            return self.played.memory.call(asked.service, asked.arguments)
+        return error("unknown_service", f"this rehearsal has no service {asked.service!r}; pass it in services")

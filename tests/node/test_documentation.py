@@ -1,0 +1,63 @@
+"""What docs/actions.md tells newcomers is true: its files are written out and run."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from services.comm.cell import Cell
+from services.comm.directory import load, verify_imports
+from services.comm.notice import Ended
+from services.lockstep_node import LockstepNode
+from services.scripted import load as load_script
+from tests.node.test_lockstep import Coordinator
+
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "actions.md"
+
+
+@pytest.fixture
+def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with all files of the page."""
+    blocks = re.findall(r"```(?:python|toml)\n# file: (\S+)\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    assert len(blocks) == 5
+    for name, text in blocks:
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    return tmp_path
+
+
+@pytest.mark.processes
+def test_the_pages_own_test_passes(files: Path) -> None:
+    ended = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_gripping.py"],
+        cwd=files,
+        env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{files}"},
+        capture_output=True,
+        text=True,
+    )
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    assert "3 passed" in ended.stdout
+
+
+@pytest.mark.parametrize("mocked", [False, True])
+def test_the_pages_node_runs_its_action(files: Path, mocked: bool) -> None:
+    directory = load(files / "services.toml")
+    assert verify_imports(directory, "bench") == ()
+    node = LockstepNode(directory, "bench", substitutes=load_script(files / "script.toml") if mocked else None)
+    coordinator = Coordinator(directory, [(2, "grip", {}), (400, "grip", {})])
+    cell = Cell([node, coordinator])
+    cell.run(lambda: False, 800)
+    ends = [n.outcome for _, n in coordinator.heard if isinstance(n, Ended)]
+    assert [(e.status, e.cause) for e in ends] == [
+        ("failure", "empty") if mocked else ("success", ""),
+        ("success", ""),
+    ]
+    assert ends[1].values == {"width": 0.03}
