@@ -1,0 +1,114 @@
+"""Strategies and helpers that the tests of the wire share."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, get_args
+
+import pytest
+from hypothesis import strategies as st
+
+from services.comm.codec import LIMITS
+from services.comm.messages import Executed, Hello, Message, Tick, Welcome
+from services.comm.wire import Connection, Side
+
+KEY = bytes(range(32))
+NONCES = {Side.CLIENT: b"c" * 32, Side.SERVER: b"s" * 32}
+
+_durations = st.floats(0.0, 1e9)
+_plain = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), 2**64 - 1)
+    | st.floats(allow_nan=False)
+    | st.text(max_size=10)
+    | st.binary(max_size=10),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=8,
+)
+_FIELDS: dict[str, st.SearchStrategy[Any]] = {
+    "str": st.text(max_size=20),
+    "bytes": st.binary(max_size=40),
+    "bool": st.booleans(),
+    "int": st.integers(0, 2**63 - 1),
+    "float": _durations,
+    "float | None": st.none() | _durations,
+    "Executed": st.sampled_from(Executed),
+    "Mapping[str, Any]": st.dictionaries(st.text(max_size=5), _plain, max_size=3),
+    "tuple[str, ...]": st.lists(st.text(max_size=20), max_size=4).map(tuple),
+    "tuple[float, ...]": st.lists(st.floats(-1e9, 1e9), max_size=9).map(tuple),
+    "tuple[Any, ...]": st.just(()),
+}
+
+
+def _messages_of(cls: type[Any]) -> st.SearchStrategy[Any]:
+    fields = {field.name: _FIELDS[str(field.type)] for field in dataclasses.fields(cls)}
+    return st.builds(cls, **fields)
+
+
+KINDS: list[type[Any]] = list(get_args(Message))
+
+
+@pytest.fixture(scope="session")
+def messages() -> st.SearchStrategy[Any]:
+    """Any message of any kind (ticks without envelopes), small enough for its kind's limit."""
+    return st.one_of([_messages_of(cls) for cls in KINDS if LIMITS[cls.KIND] >= 2048 or cls is Tick])
+
+
+@pytest.fixture(scope="session")
+def plain_data() -> st.SearchStrategy[Any]:
+    """Any plain data."""
+    return _plain
+
+
+def new_pair(key: bytes | None) -> tuple[Connection, Connection]:
+    client, server = (
+        Connection(side, key=key, nonce=NONCES[side] if key else b"") for side in (Side.CLIENT, Side.SERVER)
+    )
+    return client, server
+
+
+def greet(client: Connection, server: Connection) -> bytes:
+    """Lead both to open; gives all that the client sent."""
+    said = client.send(Hello(1, 1, "coordinator", "coord", "b0", 1))
+    hello = server.receive_data(said)
+    while not hello:
+        assert client.receive_data(server.data_to_send()) == []
+        proof = client.data_to_send()
+        said += proof
+        hello = server.receive_data(proof)
+    assert [type(message) for message in hello] == [Hello]
+    client.receive_data(server.send(Welcome(1, "vision", "b1")))
+    return said
+
+
+@pytest.fixture
+def pair() -> Callable[[bytes | None], tuple[Connection, Connection]]:
+    """Makes a client's and a server's connection that have not spoken yet, with a key or without."""
+    return new_pair
+
+
+@pytest.fixture
+def open_pair() -> Callable[[bytes | None], tuple[Connection, Connection]]:
+    """Makes a client's and a server's connection that are open to each other."""
+
+    def make(key: bytes | None) -> tuple[Connection, Connection]:
+        client, server = new_pair(key)
+        greet(client, server)
+        return client, server
+
+    return make
+
+
+@pytest.fixture
+def shake_hands() -> Callable[[Connection, Connection], bytes]:
+    """Leads two connections to open."""
+    return greet
+
+
+@pytest.fixture(params=[None, KEY], ids=["plain", "sealed"])
+def key(request: pytest.FixtureRequest) -> bytes | None:
+    """Without a key and with one."""
+    found: bytes | None = request.param
+    return found

@@ -1,0 +1,74 @@
+"""Seals, key files, and where one may listen without a key."""
+
+from __future__ import annotations
+
+import hmac
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.comm.security import (
+    KeyFileError,
+    KeyNeededError,
+    Seal,
+    new_key,
+    proof,
+    read_key,
+    require_key,
+    write_key,
+)
+
+
+@given(st.binary(min_size=1, max_size=64), st.lists(st.binary(max_size=200), max_size=5))
+def test_a_seal_is_hmac_sha256_of_number_and_body(key: bytes, bodies: list[bytes]) -> None:
+    seal = Seal(key, "client to server", b"transcript")
+    own = hmac.digest(key, b"client to server\0transcript", "sha256")
+    assert own == proof(key, "client to server", b"transcript")
+    for number, body in enumerate(bodies):
+        assert seal.next(body) == hmac.digest(own, number.to_bytes(8, "big") + body, "sha256")[:16]
+
+
+def test_a_key_file_comes_back_and_is_its_owners_alone(tmp_path: Path) -> None:
+    path, key = tmp_path / "cell.key", new_key()
+    write_key(path, key)
+    assert read_key(path) == key
+    assert path.stat().st_mode & 0o777 == 0o600
+    with pytest.raises(KeyFileError, match="exists already"):
+        write_key(path, key)
+
+
+@pytest.mark.parametrize("text", ["", "abc", "zz" * 32, "00" * 31, "00" * 33, "\xe9" * 64])
+def test_what_is_no_key_is_refused_without_showing_it(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "cell.key"
+    path.write_bytes(text.encode("latin-1"))
+    path.chmod(0o600)
+    with pytest.raises(KeyFileError, match="petrobot keys") as fault:
+        read_key(path)
+    assert not text or text not in str(fault.value)
+
+
+def test_a_key_that_others_may_read_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "cell.key"
+    write_key(path, new_key())
+    path.chmod(0o640)
+    with pytest.raises(KeyFileError, match="chmod 600"):
+        read_key(path)
+
+
+def test_a_missing_key_file_names_the_command_that_makes_one(tmp_path: Path) -> None:
+    with pytest.raises(KeyFileError, match=r"missing\.key: .*petrobot keys"):
+        read_key(tmp_path / "missing.key")
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.1.2.3", "::1", "localhost"])
+def test_loopback_needs_no_key(host: str) -> None:
+    require_key("vision", host, None)
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.5", "::", "robot.example", ""])
+def test_any_other_address_needs_one(host: str) -> None:
+    with pytest.raises(KeyNeededError, match="vision: refuses to listen"):
+        require_key("vision", host, None)
+    require_key("vision", host, new_key())

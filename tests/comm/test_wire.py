@@ -1,0 +1,352 @@
+"""One connection: cutting, handshake, states, and what an attacker may try."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.comm import messages as m
+from services.comm.codec import LIMITS, encode
+from services.comm.wire import Connection, ProtocolError, Side, State, negotiate
+
+from .conftest import KEY, KINDS, NONCES, new_pair, greet
+
+Pair = Callable[[bytes | None], tuple[Connection, Connection]]
+HELLO = m.Hello(1, 1, "coordinator", "coord", "b0", 1)
+WELCOME = m.Welcome(1, "vision", "b1", ("track",))
+
+
+def _cut(data: bytes, cuts: list[int]) -> list[bytes]:
+    places = [0, *sorted(cut % (len(data) + 1) for cut in cuts), len(data)]
+    return [data[a:b] for a, b in itertools.pairwise(places)]
+
+
+@given(st.data(), st.booleans())
+def test_any_cutting_gives_the_same_messages(
+    messages: st.SearchStrategy[Any], data: st.DataObject, sealed: bool
+) -> None:
+    client, server = new_pair(KEY if sealed else None)
+    greet(client, server)
+    allowed = messages.filter(lambda one: type(one) in FROM_CLIENT - {m.Bye, m.Refuse})
+    sent = data.draw(st.lists(allowed, max_size=6))
+    stream = b"".join(client.send(message) for message in sent)
+    cuts = data.draw(st.lists(st.integers(0, 10_000), max_size=12))
+    received = [message for piece in _cut(stream, cuts) for message in server.receive_data(piece)]
+    assert received == sent
+
+
+def test_byte_by_byte_handshake_and_call(key: bytes | None, pair: Pair) -> None:
+    client, server = pair(key)
+    towards_server, towards_client = client.send(HELLO), b""
+    seen: list[m.Message] = []
+    while towards_server or towards_client:
+        for byte in towards_server:
+            for message in server.receive_data(bytes([byte])):
+                seen.append(message)
+                if isinstance(message, m.Hello):
+                    towards_client += server.send(WELCOME)
+        towards_server = b""
+        towards_client += server.data_to_send()
+        for byte in towards_client:
+            for message in client.receive_data(bytes([byte])):
+                seen.append(message)
+                towards_server += client.send(m.Call("c1", "track"))
+        towards_client = b""
+        towards_server += client.data_to_send()
+    assert [type(message) for message in seen] == [m.Hello, m.Welcome, m.Call]
+    assert client.state is State.OPEN and server.state is State.OPEN and client.version == server.version == 1
+
+
+@given(st.lists(st.binary(max_size=60), max_size=5), st.sampled_from([None, KEY]), st.sampled_from(Side), st.booleans())
+def test_random_bytes_raise_nothing_but_protocol_error(
+    pieces: list[bytes], key: bytes | None, side: Side, opened: bool
+) -> None:
+    client, server = new_pair(key)
+    if opened:
+        greet(client, server)
+    elif side is Side.CLIENT:
+        client.send(HELLO)
+    victim = client if side is Side.CLIENT else server
+    for piece in pieces:
+        try:
+            victim.receive_data(piece)
+        except ProtocolError:
+            assert victim.state is State.CLOSED
+            assert victim.receive_data(b"anything more") == []
+            return
+
+
+@given(st.data())
+def test_what_came_well_before_a_fault_is_not_lost(messages: st.SearchStrategy[Any], data: st.DataObject) -> None:
+    client, server = new_pair(None)
+    greet(client, server)
+    allowed = messages.filter(lambda one: type(one) in FROM_CLIENT - {m.Bye, m.Refuse})
+    sent = data.draw(st.lists(allowed, min_size=1, max_size=4))
+    stream = b"".join(client.send(message) for message in sent) + bytes.fromhex("00 00 00 02 91 7f")
+    received: list[m.Message] = []
+    with pytest.raises(ProtocolError, match="unknown_kind"):
+        for piece in _cut(stream, data.draw(st.lists(st.integers(0, 10_000), max_size=6))):
+            try:
+                received += server.receive_data(piece)
+            except ProtocolError as fault:
+                received += fault.before
+                raise
+    assert received == sent
+
+
+FROM_CLIENT = {
+    m.Call,
+    m.ResultAck,
+    m.Cancel,
+    m.EventAck,
+    m.Subscribe,
+    m.Command,
+    m.Ping,
+    m.Pong,
+    m.Tick,
+    m.Bye,
+    m.Refuse,
+    m.StreamOpen,
+    m.SetPoint,
+    m.Withdraw,
+}
+FROM_SERVER = {m.Accept, m.Feedback, m.Outcome, m.Event, m.Answer, m.Ping, m.Pong, m.Tick, m.Bye, m.Refuse}
+SAMPLES: dict[type[Any], Any] = {
+    m.Hello: HELLO,
+    m.Welcome: WELCOME,
+    m.Refuse: m.Refuse("x", "y"),
+    m.Call: m.Call("c1", "track"),
+    m.Accept: m.Accept("c1"),
+    m.Feedback: m.Feedback("c1", 0.5),
+    m.Outcome: m.Outcome("c1", "success"),
+    m.ResultAck: m.ResultAck("c1"),
+    m.Cancel: m.Cancel("c1"),
+    m.Event: m.Event("tick", "timer", 0),
+    m.EventAck: m.EventAck("timer", 1),
+    m.Subscribe: m.Subscribe(("tick",)),
+    m.Command: m.Command("k1", "hold"),
+    m.Answer: m.Answer("k1", True),
+    m.Ping: m.Ping(1),
+    m.Pong: m.Pong(1),
+    m.Tick: m.Tick(1),
+    m.Bye: m.Bye("done"),
+    m.Challenge: m.Challenge(b"n" * 32),
+    m.Proof: m.Proof(b"p" * 32),
+    m.StreamOpen: m.StreamOpen("cp", 0.04),
+    m.SetPoint: m.SetPoint(1, (1.0,)),
+    m.Withdraw: m.Withdraw(),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
+def test_each_side_of_an_open_connection_says_its_own_kinds_only(kind: type[Any], open_pair: Pair) -> None:
+    for speaker, kinds in ((0, FROM_CLIENT), (1, FROM_SERVER)):
+        ends = open_pair(None)
+        if kind in kinds:
+            assert ends[1 - speaker].receive_data(ends[speaker].send(SAMPLES[kind])) == [SAMPLES[kind]]
+            continue
+        with pytest.raises(ProtocolError, match="out_of_turn"):
+            ends[speaker].send(SAMPLES[kind])
+        raw = _raw(SAMPLES[kind])
+        with pytest.raises(ProtocolError, match="out_of_turn"):
+            ends[1 - speaker].receive_data(raw)
+
+
+def _raw(message: m.Message) -> bytes:
+    body = encode(message)
+    return len(body).to_bytes(4, "big") + body
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind is not m.Hello], ids=lambda kind: kind.__name__)
+def test_a_server_takes_nothing_but_hello_first(kind: type[Any], key: bytes | None, pair: Pair) -> None:
+    _, server = pair(key)
+    with pytest.raises(ProtocolError, match="out_of_turn"):
+        server.receive_data(_raw(SAMPLES[kind]))
+
+
+@pytest.mark.parametrize("kind", [m.Call, m.Hello, m.Welcome, m.Ping], ids=lambda kind: kind.__name__)
+def test_a_server_with_a_key_takes_nothing_but_the_proof_second(kind: type[Any], pair: Pair) -> None:
+    client, server = pair(KEY)
+    assert server.receive_data(client.send(HELLO)) == []
+    with pytest.raises(ProtocolError, match="out_of_turn"):
+        server.receive_data(_raw(SAMPLES[kind]))
+
+
+def test_nothing_follows_a_last_word(open_pair: Pair) -> None:
+    for last in (m.Bye("done"), m.Refuse("x", "y")):
+        client, server = open_pair(None)
+        data = client.send(last)
+        assert client.state is State.CLOSING
+        with pytest.raises(ProtocolError, match="out_of_turn"):
+            client.send(m.Ping(1))
+        assert server.receive_data(data + _raw(m.Ping(1))) == [last]
+        assert server.state is State.CLOSED
+        assert server.receive_data(_raw(m.Ping(2))) == []
+        assert client.receive_data(_raw(m.Pong(2))) == []
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
+def test_a_frame_above_its_kinds_limit_is_refused_from_its_first_bytes(kind: type[Any], open_pair: Pair) -> None:
+    client, server = open_pair(None)
+    receiver = server if kind in FROM_CLIENT else client
+    if kind not in FROM_CLIENT | FROM_SERVER:
+        return
+    head = (LIMITS[kind.KIND] + 1).to_bytes(4, "big") + bytes([0x92, kind.KIND])
+    with pytest.raises(ProtocolError, match="too_large"):
+        receiver.receive_data(head)
+
+
+def test_a_large_hello_is_refused_from_its_first_bytes(key: bytes | None, pair: Pair) -> None:
+    _, server = pair(key)
+    with pytest.raises(ProtocolError, match="too_large"):
+        server.receive_data((LIMITS[m.Hello.KIND] + 1).to_bytes(4, "big") + bytes([0x99, m.Hello.KIND]))
+
+
+def test_a_refusal_reaches_a_client_that_is_opening(key: bytes | None, pair: Pair) -> None:
+    client, server = pair(key)
+    hello = server.receive_data(client.send(HELLO))
+    if not hello:
+        client.receive_data(server.data_to_send())
+        server.receive_data(client.data_to_send())
+    refusal = m.Refuse("directory", "copy the file")
+    assert client.receive_data(server.send(refusal)) == [refusal]
+    assert client.state is State.CLOSED and server.state is State.CLOSING
+
+
+@pytest.mark.parametrize(
+    ("oldest", "newest", "version"),
+    [(1, 1, 1), (1, 9, 1), (0, 1, 1), (2, 9, None), (0, 0, None), (1, 0, None)],
+)
+def test_versions_are_negotiated(oldest: int, newest: int, version: int | None) -> None:
+    assert negotiate(oldest, newest) == version
+
+
+def test_a_client_without_a_common_version_is_refused(pair: Pair) -> None:
+    _, server = pair(None)
+    with pytest.raises(ProtocolError, match="version") as fault:
+        server.receive_data(_raw(m.Hello(2, 3, "node", "n", "b")))
+    assert "update the older side" in fault.value.text
+
+
+def test_a_server_that_chooses_a_version_nobody_offered_is_refused(pair: Pair) -> None:
+    client, _ = pair(None)
+    client.send(HELLO)
+    with pytest.raises(ProtocolError, match="version"):
+        client.receive_data(_raw(m.Welcome(7, "vision", "b1")))
+
+
+KEYS = [
+    pytest.param(None, KEY, "key_needed", id="client without a key"),
+    pytest.param(KEY, None, "no_key_here", id="server without a key"),
+    pytest.param(KEY, KEY[::-1], "wrong_key", id="another key"),
+]
+
+
+@pytest.mark.parametrize(("client_key", "server_key", "code"), KEYS)
+def test_keys_that_do_not_fit_are_refused_by_the_server(
+    client_key: bytes | None, server_key: bytes | None, code: str
+) -> None:
+    client = Connection(Side.CLIENT, key=client_key, nonce=NONCES[Side.CLIENT] if client_key else b"")
+    server = Connection(Side.SERVER, key=server_key, nonce=NONCES[Side.SERVER] if server_key else b"")
+    with pytest.raises(ProtocolError, match=code):
+        server.receive_data(client.send(HELLO))
+        client.receive_data(server.data_to_send())
+        server.receive_data(client.data_to_send())
+
+
+def test_a_server_that_does_not_know_the_key_is_refused_by_the_client(pair: Pair) -> None:
+    for answer in (WELCOME, m.Challenge(b"short")):
+        client, _ = pair(KEY)
+        client.send(HELLO)
+        with pytest.raises(ProtocolError, match=r"no_key_there|malformed"):
+            client.receive_data(_raw(answer))
+    client, _ = pair(KEY)
+    client.send(HELLO)
+    client.receive_data(_raw(m.Challenge(b"s" * 32)))
+    for auth in (b"", b"x" * 32):
+        forged = Connection(Side.CLIENT, key=KEY, nonce=NONCES[Side.CLIENT])
+        forged.send(HELLO)
+        forged.receive_data(_raw(m.Challenge(b"s" * 32)))
+        with pytest.raises(ProtocolError, match="wrong_key"):
+            forged.receive_data(_raw(m.Welcome(1, "vision", "b1", auth=auth)))
+
+
+def test_a_client_without_a_key_says_so_when_it_is_asked_for_one(pair: Pair) -> None:
+    client, _ = pair(None)
+    client.send(HELLO)
+    with pytest.raises(ProtocolError, match="key_needed"):
+        client.receive_data(_raw(m.Challenge(b"s" * 32)))
+
+
+def test_a_changed_version_range_breaks_the_proof(pair: Pair) -> None:
+    client, server = pair(KEY)
+    hello = client.send(m.Hello(1, 3, "coordinator", "coord", "b0"))
+    assert server.receive_data(hello.replace(b"\x01\x01\x03", b"\x01\x01\x01", 1)) == []
+    client.receive_data(server.data_to_send())
+    with pytest.raises(ProtocolError, match="wrong_key"):
+        server.receive_data(client.data_to_send())
+
+
+def test_a_changed_welcome_breaks_its_proof(pair: Pair) -> None:
+    client, server = pair(KEY)
+    server.receive_data(client.send(HELLO))
+    client.receive_data(server.data_to_send())
+    server.receive_data(client.data_to_send())
+    welcome = server.send(WELCOME)
+    with pytest.raises(ProtocolError, match="wrong_key"):
+        client.receive_data(welcome.replace(b"track", b"trick"))
+
+
+def test_a_recorded_session_cannot_be_played_again(pair: Pair, shake_hands: Callable[..., bytes]) -> None:
+    client, server = pair(KEY)
+    recorded = shake_hands(client, server) + client.send(m.Call("c1", "move"))
+    again = Connection(Side.SERVER, key=KEY, nonce=b"t" * 32)
+    with pytest.raises(ProtocolError, match="wrong_key"):
+        again.receive_data(recorded)
+        again.receive_data(recorded)
+
+
+Tamper = Callable[[list[bytes]], list[bytes]]
+TAMPERS: dict[str, Tamper] = {
+    "repeated": lambda frames: [frames[0], frames[0]],
+    "left out": lambda frames: frames[1:],
+    "swapped": lambda frames: [frames[1], frames[0]],
+    "one bit": lambda frames: [frames[0][:-20] + bytes([frames[0][-20] ^ 1]) + frames[0][-19:]],
+    "seal cut": lambda frames: [(len(frames[0]) - 5).to_bytes(4, "big") + frames[0][4:-1]],
+    "no seal": lambda frames: [_raw(m.Call("c1", "move", {"to": "somewhere else"}))],
+}
+
+
+@pytest.mark.parametrize("tamper", TAMPERS.values(), ids=TAMPERS.keys())
+def test_a_sealed_frame_moved_or_changed_is_refused(tamper: Tamper, open_pair: Pair) -> None:
+    client, server = open_pair(KEY)
+    frames = [client.send(m.Call(f"c{n}", "move", {"to": n})) for n in range(2)]
+    with pytest.raises(ProtocolError, match=r"bad_seal|malformed"):
+        for frame in tamper(frames):
+            server.receive_data(frame)
+    assert server.state is State.CLOSED
+
+
+def test_a_frame_cannot_be_sent_back_to_its_sender(open_pair: Pair) -> None:
+    client, server = open_pair(KEY)
+    ping = client.send(m.Ping(1))
+    with pytest.raises(ProtocolError, match="bad_seal"):
+        client.receive_data(ping)
+    assert server.receive_data(ping) == [m.Ping(1)]
+
+
+def test_a_connection_with_a_key_needs_a_nonce() -> None:
+    with pytest.raises(ValueError, match="nonce of 32 bytes"):
+        Connection(Side.CLIENT, key=KEY)
+
+
+def test_a_message_that_is_too_large_leaves_the_connection_as_it_was(key: bytes | None, open_pair: Pair) -> None:
+    client, server = open_pair(key)
+    with pytest.raises(ProtocolError, match="too_large"):
+        client.send(m.Cancel("c1", "x" * 5000))
+    assert server.receive_data(client.send(m.Ping(1))) == [m.Ping(1)]
