@@ -33,7 +33,7 @@ NOISE_ZERO = 128
 NOISE_SIZE = 1280
 LIGHT_DIRECTION = np.array([-0.25, 0.35, 0.90]) / np.linalg.norm([-0.25, 0.35, 0.90])
 """Towards the lamp, base frame."""
-LENS_STEPS = 8
+LENS_STEPS = 6
 CIRCLE = np.stack([f(np.linspace(0.0, 2.0 * np.pi, 13)[:-1]) for f in (np.cos, np.sin)], axis=-1)
 
 
@@ -131,7 +131,10 @@ class PinholeCamera:
 
     def _on_plane(self, pixels: Array, origin: Array, normal: Array) -> Array:
         """Base-frame points (..., 3) where pixels look through a plane."""
-        direction = self.rays(pixels) @ self.rotation
+        return self._through(self.rays(pixels) @ self.rotation, origin, normal)
+
+    def _through(self, direction: Array, origin: Array, normal: Array) -> Array:
+        """Points (..., 3) where base-frame directions (..., 3) from the optical centre pass a plane."""
         distance = ((origin - self.position) @ normal) / (direction @ normal)
         return np.asarray(self.position + distance[..., None] * direction)
 
@@ -156,8 +159,9 @@ class PinholeCamera:
 
     def _scene_grey(self, pixels: Array) -> Array:
         up = np.array([0.0, 0.0, 1.0])
-        table = self._on_plane(pixels, np.array([0.0, 0.0, self.table.top]), up)
-        floor = self._on_plane(pixels, np.zeros(3), up)
+        direction = self.rays(pixels) @ self.rotation
+        table = self._through(direction, np.array([0.0, 0.0, self.table.top]), up)
+        floor = self._through(direction, np.zeros(3), up)
         on_table = self.table.contains(table[..., 0], table[..., 1])
         return np.where(
             on_table, self.table.grey(table[..., 0], table[..., 1]), floor_grey(floor[..., 0], floor[..., 1])
@@ -166,7 +170,7 @@ class PinholeCamera:
     @cached_property
     def background(self) -> Picture:
         """The scene without ball, arm and cup, lit, without noise (height, width)."""
-        grey = supersampled(self._grid, self._scene_grey, 3) * self.illumination
+        grey = supersampled(self._grid, self._scene_grey, 2) * self.illumination
         return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
 
     # Images

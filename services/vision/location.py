@@ -40,7 +40,8 @@ class Detector(Protocol):
 class Background:
     """Mean grey levels of the empty table, learned from images and kept between runs.
 
-    The first `first` images count equally, each later one `rate`: slow light is followed, a ball leaves no trace.
+    The first `first` images count equally, each later one `rate`: slow light is followed, and a ball that
+    passes leaves less than a detector's threshold.
     """
 
     def __init__(self, first: int = 5, rate: float = 0.08) -> None:

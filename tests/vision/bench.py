@@ -1,0 +1,248 @@
+"""A small laboratory for the vision tests: the simulated camera over an analytic rolling ball, and a lock-step run of actions."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Coroutine, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.action import Cancelled, Result, Wait
+from services.comm.camera import MemoryImages
+from services.comm.image import Image
+from sim.camera import PinholeCamera
+from sim.truth import read_truth
+
+Array = NDArray[np.float64]
+ROOT = Path(__file__).parents[2]
+TICK = 0.004
+REGIMES = {"A": (0.7, 1.5), "B": (1.5, 2.0), "C": (2.0, 2.5)}
+
+
+def read_cell() -> dict[str, Any]:
+    """The shipped cell."""
+    return tomllib.loads((ROOT / "services" / "cell.toml").read_text(encoding="utf-8"))
+
+
+def true_view(cell: Mapping[str, Any], **changes: Any) -> dict[str, Any]:
+    """The simulated camera's truth as PinholeCamera takes it."""
+    camera = read_truth(cell, "A").camera
+    view = {key: getattr(camera, key) for key in ("position", "rotation", "focal_px", "principal_px", "distortion")}
+    return {**view, **changes}
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A ball that slides, then rolls on a straight line; written from the mechanics, not from services or sim.
+
+    Released at time 0 from `start` towards `aim` (x, y) with `speed`; a hollow ball with spin share s settles at (3 + 2 s) / 5.
+    """
+
+    start: tuple[float, float]
+    aim: tuple[float, float]
+    speed: float
+    spin: float = 0.85
+    rolling: float = 0.0589
+    friction: float = 0.20
+
+    @property
+    def heading(self) -> Array:
+        """Unit vector (2,)."""
+        way = np.subtract(self.aim, self.start)
+        return np.asarray(way / np.hypot(*way))
+
+    def _phases(self) -> tuple[float, float, float]:
+        """When sliding ends (s), the way until then (m), and the speed from then on (m/s)."""
+        settled = self.speed * (3.0 + 2.0 * self.spin) / 5.0
+        slide = self.friction * 9.81
+        until = (self.speed - settled) / slide
+        return until, self.speed * until - 0.5 * slide * until**2, settled
+
+    def way(self, t: float) -> tuple[float, float]:
+        """Way (m) and speed (m/s) at time t >= 0."""
+        until, slid, settled = self._phases()
+        if t <= until:
+            slide = self.friction * 9.81
+            return self.speed * t - 0.5 * slide * t * t, self.speed - slide * t
+        rolled = min(t - until, settled / self.rolling)
+        return slid + settled * rolled - 0.5 * self.rolling * rolled**2, settled - self.rolling * rolled
+
+    def place(self, t: float) -> Array:
+        """(2,) m."""
+        return np.asarray(np.asarray(self.start) + self.heading * self.way(t)[0])
+
+    def velocity(self, t: float) -> Array:
+        """(2,) m/s."""
+        return np.asarray(self.heading * self.way(t)[1])
+
+    def arrival(self, way: float) -> float:
+        """When it has gone `way` m; it must not stop before."""
+        until, slid, settled = self._phases()
+        under = settled**2 - 2.0 * self.rolling * (way - slid)
+        return until + (settled - float(np.sqrt(under))) / self.rolling
+
+    def leaves(self, near_edge: float = 0.62) -> tuple[float, float]:
+        """Time (s) and y (m) at which its centre passes the near edge."""
+        way = (near_edge - self.start[0]) / self.heading[0]
+        return self.arrival(float(way)), float(self.start[1] + way * self.heading[1])
+
+
+def draw_ball(rng: np.random.Generator, regime: str = "A") -> Ball:
+    """A throw of the regime, as the cell's notes have it."""
+    return Ball(
+        start=(2.12, float(rng.uniform(-0.3, 0.3))),
+        aim=(0.62, float(rng.uniform(-0.3, 0.3))),
+        speed=float(rng.uniform(*REGIMES[regime])),
+        spin=float(rng.uniform(0.7, 1.0)),
+        rolling=0.0589 * float(rng.uniform(0.7, 1.3)),
+    )
+
+
+@dataclass
+class Bench:
+    """The simulated camera over a table with at most one ball, in lock step; `drawn` may add arm and cup."""
+
+    camera: PinholeCamera
+    ball: Ball | None = None
+    release: float = 0.5
+    latency: float = 0.012
+    light: Callable[[float], float] = lambda time: 1.0
+    gone_after: float = float("inf")
+    """s after the release: somebody takes the ball away."""
+    dead_from: float = float("inf")
+    """s: the camera dies."""
+    arm: tuple[Sequence[Any], Sequence[float]] | None = None
+    cup: Array | None = None
+    now: float = 0.0
+    images: MemoryImages = field(init=False)
+    exposures: int = 0
+
+    def __post_init__(self) -> None:
+        self.images = MemoryImages(self._control)
+        self._rate = 0.0
+        self._due = 0.0
+        self._sent: list[Image] = []
+
+    def _control(self, rate: float) -> None:
+        self._rate, self._due = rate, self.now + TICK
+
+    def picture(self) -> NDArray[np.uint8]:
+        """An image of the world as it is now."""
+        since = self.now - self.release
+        ball = velocity = None
+        if self.ball is not None and 0.0 <= since < self.gone_after:
+            place, speed = self.ball.place(since), self.ball.velocity(since)
+            if place[0] > 0.62 and abs(place[1]) < 0.45:
+                ball, velocity = [*place, 0.62], [*speed, 0.0]
+        points, radii = self.arm if self.arm else (None, ())
+        return self.camera.render(ball, velocity or (0, 0, 0), points, radii, self.cup, self.light(self.now))
+
+    def advance(self) -> None:
+        """One tick."""
+        self.now = round(self.now + TICK, 9)
+        if self._rate > 0.0 and self.now >= self._due - 1e-9 and self.now < self.dead_from:
+            self._sent.append(Image(self.picture(), self.now, self.exposures))
+            self.exposures += 1
+            self._due += 1.0 / self._rate
+        while self._sent and self._sent[0].time + self.latency <= self.now + 1e-9:
+            self.images.put(self._sent.pop(0))
+
+
+class BenchPorts:
+    """What the camera's driver may reach on the bench."""
+
+    def __init__(self, bench: Bench, files: Mapping[str, bytes] | None = None) -> None:
+        self._bench = bench
+        self._files = files or {}
+
+    @property
+    def now(self) -> float:
+        return self._bench.now
+
+    def images(self) -> Any:
+        return self._bench.images
+
+    def file(self, path: str) -> bytes:
+        return self._files[path]
+
+    def can(self) -> Any:
+        raise AssertionError("a camera has no bus")
+
+    def stream(self, name: str) -> Any:
+        raise AssertionError("a camera takes no set points")
+
+    def raise_event(self, name: str, **data: Any) -> None:
+        raise AssertionError("a camera raises no events")
+
+
+@dataclass
+class BenchContext:
+    """The context of one run, driven by `run_action`. `published` holds (time, values), values None where withdrawn."""
+
+    bench: Bench
+    device: Any
+    run: str = "1"
+    published: list[tuple[float, list[float] | None]] = field(default_factory=list)
+
+    @property
+    def now(self) -> float:
+        return self.bench.now
+
+    def wait(self, ready: Callable[[], bool], timeout: float | None = None) -> Wait:
+        return Wait(ready, None if timeout is None else self.now + timeout)
+
+    def sleep(self, seconds: float) -> Wait:
+        return Wait(lambda: False, self.now + seconds)
+
+    def publish(self, stream: str, values: Sequence[float]) -> None:
+        assert stream == "catch_point"
+        self.published.append((self.now, [float(v) for v in values]))
+
+    def withdraw(self, stream: str) -> None:
+        self.published.append((self.now, None))
+
+    def raise_event(self, name: str, **data: Any) -> None:
+        raise AssertionError("vision raises no events")
+
+    def progress(self, fraction: float, **data: Any) -> None:
+        assert 0.0 <= fraction <= 1.0
+
+    async def call(self, service: str, /, deadline: float | None = None, **arguments: Any) -> Result:
+        raise AssertionError("vision calls nobody")
+
+    async def get(self, name: str) -> Any:
+        raise AssertionError("vision reads no variables")
+
+    async def put(self, name: str, value: Any) -> int:
+        raise AssertionError("vision writes no variables")
+
+    async def compare_and_set(self, name: str, version: int, value: Any) -> bool:
+        raise AssertionError("vision writes no variables")
+
+    def random(self, purpose: str) -> Any:
+        raise AssertionError("vision draws nothing")
+
+
+def run_action(
+    bench: Bench, action: Coroutine[Any, Any, Result], limit: float = 20.0, cancel_at: float = float("inf")
+) -> Result:
+    """Drive an action's coroutine tick by tick, as the lock-step shell does. `cancel_at`: the run is cancelled then (s)."""
+    begin = bench.now
+    try:
+        wait = action.send(None)
+        while bench.now < begin + limit:
+            bench.advance()
+            if bench.now >= cancel_at:
+                action.throw(Cancelled())
+                raise AssertionError("a cancelled run went on")
+            if wait.ready() or (wait.due is not None and bench.now >= wait.due - 1e-9):
+                wait = action.send(None)
+    except StopIteration as done:
+        result: Result = done.value
+        return result
+    action.close()
+    raise AssertionError(f"the action still goes on after {limit} s")

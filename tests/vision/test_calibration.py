@@ -1,0 +1,246 @@
+"""Calibration: from rendered board images it finds the seeded truth; from corners alone over many cameras; files and command."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from services.vision import calibrate as command
+from services.vision.calibration import Board, BoardView, Calibration, CalibrationError, adjust, calibrate, find_corners
+from services.vision.calibration_file import (
+    DEFAULT,
+    CalibrationFileError,
+    calibration_text,
+    parse_calibration,
+    read_views,
+)
+from services.vision.optics import Array, Optics
+from sim.board import HELD, LAID, board_views, save_board_views
+from sim.camera import PinholeCamera
+from tests.vision.test_optics import drawn_optics
+
+Views = list[BoardView]
+
+
+def table_error(found: Optics, camera: PinholeCamera | Optics) -> Array:
+    """Distances (m) between where balls are on the table and where the calibrated camera takes them to be."""
+    x, y = np.meshgrid(np.linspace(0.62, 2.22, 17), np.linspace(-0.45, 0.45, 9))
+    balls = np.stack([x, y, np.full_like(x, 0.62)], axis=-1).reshape(-1, 3)
+    off = found.to_plane(camera.project(balls), 0.62) - balls[:, :2]
+    return np.asarray(np.hypot(off[:, 0], off[:, 1]))
+
+
+@pytest.fixture(scope="module")
+def folder(cell: dict[str, Any], pinhole: PinholeCamera, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Board images of the simulated camera, as somebody would take them."""
+    pinhole.reseed(np.random.default_rng(21))
+    place = tmp_path_factory.mktemp("views")
+    save_board_views(place, cell, pinhole, np.random.default_rng(22))
+    return place
+
+
+@pytest.fixture(scope="module")
+def views(folder: Path) -> Views:
+    return read_views(folder)[0]
+
+
+@pytest.fixture(scope="module")
+def found(views: Views) -> Calibration:
+    return calibrate(views, Board())
+
+
+def test_rendered_boards_give_the_true_camera(found: Calibration, pinhole: PinholeCamera, cell: dict[str, Any]) -> None:
+    error = table_error(found.optics, pinhole)
+    assert float(np.sqrt(np.mean(error**2))) < 0.5e-3
+    assert error.max() < 1.0e-3
+    nominal = table_error(Optics.nominal(cell), pinhole)
+    assert float(np.sqrt(np.mean(nominal**2))) > 5e-3, "the truth differs: there was something to find"
+    assert found.residual_px < 0.15
+    assert found.table_residual < 1e-3
+    assert found.table_sigma < 0.6e-3
+    assert found.optics.focal[0] == pytest.approx(pinhole.focal, abs=2.0)
+
+
+def test_distortion_matters(found: Calibration, pinhole: PinholeCamera) -> None:
+    straight = replace(found.optics, distortion=(0.0, 0.0, 0.0, 0.0))
+    assert table_error(straight, pinhole).max() > 10e-3
+
+
+def test_shipped_calibration_fits_the_simulated_camera(pinhole: PinholeCamera) -> None:
+    shipped = parse_calibration(DEFAULT.read_text(encoding="utf-8"), DEFAULT.name)
+    error = table_error(shipped.optics, pinhole)
+    assert float(np.sqrt(np.mean(error**2))) < 0.5e-3
+    assert not np.allclose(shipped.optics.position, pinhole.position, atol=1e-7), "calibrated, not copied"
+
+
+def synthetic_corners(optics: Optics, rng: np.random.Generator, noise: float, placement: float) -> tuple[Any, Any]:
+    """Corners (px) and stated poses of boards laid and held, without images."""
+    corners: list[Array] = []
+    poses: list[Array | None] = []
+    board = Board()
+    middle = np.array([(board.columns - 1) / 2, (board.rows - 1) / 2, 0.0]) * board.square
+    for along, y, turn in LAID:
+        rotation = cv2.Rodrigues(np.array([0.0, 0.0, turn]))[0]
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, np.array([0.62 + along, y, 0.60]) - rotation @ middle
+        moved = pose[:3, 3] + [*rng.normal(0, placement, 2), 0.0]
+        points = board.points() @ rotation.T + moved
+        corners.append(optics.project(points) + rng.normal(0, noise, (len(points), 2)))
+        poses.append(pose)
+    for along, y, above, *turns in HELD:
+        rotation = cv2.Rodrigues(np.array(turns))[0]
+        points = (board.points() - middle) @ rotation.T + [0.62 + along, y, 0.60 + above]
+        corners.append(optics.project(points) + rng.normal(0, noise, (len(points), 2)))
+        poses.append(None)
+    return corners, poses
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_any_camera_is_found_from_exact_corners(cell: dict[str, Any], seed: int) -> None:
+    truth = drawn_optics(cell, seed)
+    corners, poses = synthetic_corners(truth, np.random.default_rng(seed), 0.0, 0.0)
+    result = adjust(corners, poses, Board(), (640, 480))
+    assert table_error(result.optics, truth).max() < 1e-6
+    assert np.allclose(result.optics.distortion, truth.distortion, atol=1e-5)
+    assert np.allclose(result.optics.position, truth.position, atol=1e-5)
+
+
+def test_stated_accuracy_is_that_of_repeated_calibrations(cell: dict[str, Any]) -> None:
+    """The standard deviation that a calibration states is that by which calibrations of one camera differ."""
+    truth, errors, stated = drawn_optics(cell, 0), [], []
+    for seed in range(6):
+        corners, poses = synthetic_corners(truth, np.random.default_rng(seed), 0.07, 0.0003)
+        result = adjust(corners, poses, Board(), (640, 480))
+        errors.append(table_error(result.optics, truth))
+        stated.append(result.table_sigma)
+    measured = float(np.sqrt(np.mean(np.square(errors))))
+    assert measured < 0.5e-3
+    assert 0.4 < np.mean(stated) / measured < 2.5
+
+
+def test_too_few_views_are_refused(views: Views) -> None:
+    with pytest.raises(CalibrationError, match="known pose; take at least 6"):
+        calibrate(views[:3], Board())
+    blank = BoardView(np.zeros((480, 640), np.uint8), np.eye(4))
+    with pytest.raises(CalibrationError, match="seen in 0 of 2 images"):
+        calibrate([blank] * 2, Board())
+
+
+def test_corners_come_in_the_boards_order_whichever_way_it_lies(pinhole: PinholeCamera) -> None:
+    board = Board()
+    for turn in (0.0, np.pi / 2, np.pi, -np.pi / 2):
+        pose = np.eye(4)
+        pose[:3, :3] = cv2.Rodrigues(np.array([0.0, 0.0, turn]))[0]
+        pose[:3, 3] = np.array([1.42, 0.0, 0.6]) - pose[:3, :3] @ [0.24, 0.15, 0.0]
+        corners = find_corners(pinhole.render_board(pose), board)
+        assert corners is not None
+        wanted = pinhole.project(board.points() @ pose[:3, :3].T + pose[:3, 3])
+        assert np.abs(corners - wanted).max() < 1.0
+
+
+def test_file_round_trip(found: Calibration) -> None:
+    again = parse_calibration(calibration_text(found), "calibration.toml")
+    assert np.allclose(again.optics.rotation, found.optics.rotation, atol=1e-9)
+    assert again.optics.focal == pytest.approx(found.optics.focal, abs=1e-8)
+    assert again.views == found.views
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "fault"),
+    [
+        ("schema = 1", "schema = 7", "schema must be 1"),
+        ("centre_px", "center_px", "key 'centre_px' is missing"),
+        ("[pose]", "[pose", "no TOML"),
+        ("position = [", "position = [1.0, ", "cannot reshape"),
+        ("rotation = [\n  [", "rotation = [\n  [9", "no rotation"),
+    ],
+)
+def test_bad_file_is_refused_with_file_and_remedy(old: str, new: str, fault: str) -> None:
+    text = DEFAULT.read_text(encoding="utf-8").replace(old, new, 1)
+    with pytest.raises(CalibrationFileError, match=r"lab\.toml: .*remake it") as refused:
+        parse_calibration(text, "lab.toml")
+    assert fault in str(refused.value)
+
+
+def test_command_writes_what_the_driver_reads(
+    folder: Path, tmp_path: Path, pinhole: PinholeCamera, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = tmp_path / "calibration.toml"
+    assert command.calibrate_main(["--views", str(folder), "--output", str(target)]) == 0
+    said = capsys.readouterr().out
+    assert "board seen whole in" in said and str(target) in said
+    read = parse_calibration(target.read_text(encoding="utf-8"), target.name)
+    assert table_error(read.optics, pinhole).max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        (None, "cannot be read"),
+        ("[board", "no TOML"),
+        ("[board]\ncolumns = 9\nrows = 6\n", "key 'square' is missing"),
+        ('[board]\ncolumns=9\nrows=6\nsquare=0.06\n[[views]]\nfile="a.png"\n', "a.png: no image"),
+        ('[board]\ncolumns=9\nrows=6\nsquare=0.06\n[[views]]\nfile="a.png"\npose=[1]\n', "4 rows of 4"),
+    ],
+)
+def test_bad_views_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str | None, fault: str
+) -> None:
+    if text is not None:
+        (tmp_path / "views.toml").write_text(text, encoding="utf-8")
+    assert command.calibrate_main(["--views", str(tmp_path), "--output", str(tmp_path / "out.toml")]) == 2
+    assert fault in capsys.readouterr().err
+    assert not (tmp_path / "out.toml").exists()
+
+
+def test_missing_images_are_taken_from_the_camera(folder: Path, views: Views, tmp_path: Path) -> None:
+    """A folder with views.toml alone: each image is taken when the operator says so, and again when the board is cut off."""
+    from services.comm.image import Image
+
+    lines = (folder / "views.toml").read_text(encoding="utf-8").split("[[views]]")
+    (tmp_path / "views.toml").write_text("[[views]]".join(lines[:3]), encoding="utf-8")
+    shown = [np.zeros((480, 640), np.uint8), views[0].pixels, views[1].pixels]
+    asked: list[str] = []
+
+    class Hand:
+        """A camera that shows what the operator holds into it."""
+
+        sequence = 0
+
+        def start(self, rate: float) -> None:
+            assert rate > 0
+
+        def stop(self) -> None: ...
+
+        def close(self) -> None:
+            asked.append("closed")
+
+        def newest(self) -> Image | None:
+            self.sequence += 1
+            return Image(shown[len(asked) - 1], 0.0, self.sequence)
+
+    def press_enter(text: str) -> str:
+        asked.append(text)
+        return ""
+
+    said: list[str] = []
+    command.take_missing(tmp_path, Hand(), said.append, press_enter)
+    assert said == ["the board is not seen whole; once more"]
+    assert asked[-1] == "closed" and len(asked) == 4
+    taken, _ = read_views(tmp_path)
+    assert np.array_equal(taken[0].pixels, views[0].pixels) and np.array_equal(taken[1].pixels, views[1].pixels)
+
+
+def test_measured_places_differ_from_true_ones(cell: dict[str, Any], pinhole: PinholeCamera) -> None:
+    """The simulated operator errs: boards do not lie exactly where they were measured."""
+    poses = [pose for _, pose in zip(range(3), board_views(cell, pinhole, np.random.default_rng(0)), strict=False)]
+    first = find_corners(poses[0][0], Board())
+    stated = poses[0][1]
+    assert first is not None and stated is not None
+    wanted = pinhole.project(Board().points() @ stated[:3, :3].T + stated[:3, 3])
+    assert 0.01 < np.abs((first - wanted).mean(axis=0)).max() < 0.6
