@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import secrets
-import socket
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -16,8 +16,9 @@ from coordinator.executor import Executor, FirstAlternative, Forgetful, Observer
 from coordinator.journal import Journal, JournalWriter
 from coordinator.lockstep_party import NAME, CoordinatorParty
 from coordinator.mission import Mission
+from coordinator.realtime import key_of
 from coordinator.recording import EPOCH, JournalStore, boots, last_epoch, replay
-from coordinator.supervisor import Program, is_local, laboratory_program, node_program
+from coordinator.supervisor import Program, is_local
 from coordinator.task import Task
 from services.comm.caller import Caller
 from services.comm.cell import Cell, Delays
@@ -89,7 +90,7 @@ def lockstep_mission(directory: Directory, setting: Setting) -> Mission:
 def lockstep_party(directory: Directory, node: NodeEntry, substitutes: Substitutes | None = None) -> Party:
     """The party of a node: a laboratory's own, or a node with its drivers and actions inline."""
     if node.sim:
-        party: Party = load_object(node.sim)(directory, node.name)
+        party: Party = load_object("sim.laboratory:make_laboratory")(directory, node.name)
         return party
     return load_object(NODE_PARTY)(directory, node.name, substitutes=substitutes)  # type: ignore[no-any-return]
 
@@ -115,12 +116,11 @@ def lockstep_member(
     mission = lockstep_mission(directory, setting)
     watching = None if watch is None else lambda now: watch(mission, now)
     coordinator = CoordinatorParty(directory, mission, watching)
-    listener = socket.create_server(("127.0.0.1", 0))
-    addresses = {node: directory.address(node) for node in directory.nodes} | {NAME: listener.getsockname()[:2]}
     delays = Delays(directory.delays())
-    return Member(
-        NAME, [coordinator], addresses, delays=delays, directory=directory.hash, listener=listener
-    ), coordinator
+    member = Member(
+        NAME, [coordinator], directory.members(), delays=delays, directory=directory.hash, key=key_of(directory)
+    )
+    return member, coordinator
 
 
 # --- real time ---------------------------------------------------------------------------------------------------------
@@ -161,9 +161,14 @@ def resumed_mission(
     return mission, lambda now: mission.resume(now, executor.state, boots(journal), origin)
 
 
-def local_programs(directory: Directory, *, lockstep: bool = False, source: Path | None = None) -> list[Program]:
+def local_programs(directory: Directory, *, lockstep: bool = False, mock: Path | None = None) -> list[Program]:
     """The command lines of the nodes whose address is this host's, the laboratory first."""
-    services = source or directory.source
     local = sorted((n for n in directory.nodes.values() if is_local(n.host)), key=lambda node: not node.sim)
-    launch: Mapping[bool, Callable[..., Program]] = {True: laboratory_program, False: node_program}
-    return [launch[bool(node.sim)](node.name, services, lockstep=lockstep) for node in local]
+    options = ["--services", str(directory.source), *(["--lockstep"] if lockstep else [])]
+    scripted = ["--mock", str(mock)] if mock else []
+    return [
+        Program(node.name, [sys.executable, "-m", "sim", *options])
+        if node.sim
+        else Program(node.name, [sys.executable, "-m", "services", node.name, *options, *scripted])
+        for node in local
+    ]

@@ -33,6 +33,10 @@ class Stage(Enum):
 class MissionError(Exception):
     """A mission run could not be prepared or scored: which service said what."""
 
+    def __init__(self, text: str, *, bad_input: bool = False) -> None:
+        super().__init__(text)
+        self.bad_input = bad_input
+
 
 @dataclass(slots=True)
 class Cycle:
@@ -205,7 +209,7 @@ class Mission:
     def _answered(self, now: float, outcome: Outcome) -> None:
         if outcome.status != Status.SUCCESS:
             what = outcome.id.rpartition("/")[2]
-            raise MissionError(f"{what}: {outcome.cause}: {outcome.text}")
+            raise MissionError(f"{what}: {outcome.text or outcome.cause}", bad_input=outcome.cause == "bad_arguments")
         if self.stage is Stage.PREPARING:
             self._begin(now)
         elif self.stage is Stage.SCORING:

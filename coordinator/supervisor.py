@@ -7,7 +7,6 @@ import contextlib
 import ctypes
 import signal
 import socket
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -163,15 +162,3 @@ def _signal(child: _Child, number: signal.Signals) -> None:
     if child.process and child.process.returncode is None:
         with contextlib.suppress(ProcessLookupError):
             child.process.send_signal(number)
-
-
-def node_program(name: str, services: Path, *, lockstep: bool = False) -> Program:
-    """The command line that launches a node."""
-    mode = ["--lockstep"] if lockstep else []
-    return Program(name, [sys.executable, "-m", "services", name, "--services", str(services), *mode])
-
-
-def laboratory_program(name: str, services: Path, *, lockstep: bool = False) -> Program:
-    """The command line that launches the simulated laboratory."""
-    mode = ["--lockstep"] if lockstep else []
-    return Program(name, [sys.executable, "-m", "sim", "--services", str(services), *mode])

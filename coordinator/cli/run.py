@@ -64,6 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Check the task, run it, print and write the result."""
     from coordinator.mission import MissionError
+    from services.comm.directory import DirectoryError
 
     directory, task = load_directory(options.services), load_task(options.task)
     _refuse_unfit(task, directory)
@@ -75,7 +76,9 @@ def run(options: argparse.Namespace) -> int:
         else:
             mission, timeline = asyncio.run(_run_realtime(directory, setting, options))
     except MissionError as fault:
-        raise CommandError(1, str(fault)) from fault
+        raise CommandError(2 if fault.bad_input else 1, str(fault)) from fault
+    except DirectoryError as fault:
+        raise CommandError(2, str(fault)) from fault
     result = mission.result(options.mode, time.perf_counter() - begun)
     give(result, task, timeline, options, options.folder)
     return 0 if result["status"] == "success" else 1
@@ -189,11 +192,9 @@ async def _spread_lockstep(
     from coordinator.launch import local_programs, lockstep_member
     from coordinator.supervisor import Supervisor
 
-    if options.mock is not None:
-        raise CommandError(2, "--mock in lock step needs --processes 1: scripted actions live in this process")
     member, party = lockstep_member(directory, setting, watch)
     party.mission.executor.observers.append(timeline)
-    programs = local_programs(directory, lockstep=member.address)
+    programs = local_programs(directory, lockstep=True, mock=options.mock)
     supervisor = Supervisor(programs, Path("runs/logs"), respawn=False, wait_ready=False)
     async with supervisor:
         await asyncio.to_thread(_go, member, lambda: party.over)
@@ -276,7 +277,7 @@ def _nodes(directory: Directory, options: argparse.Namespace) -> AbstractAsyncCo
     from coordinator.launch import local_programs
     from coordinator.supervisor import Supervisor
 
-    return Supervisor(local_programs(directory), Path("runs/logs"), notice=print)
+    return Supervisor(local_programs(directory, mock=options.mock), Path("runs/logs"), notice=print)
 
 
 async def _watched(running: Any, mission: Mission, watch: Callable[[Mission, float], None] | None) -> None:
