@@ -108,6 +108,8 @@ _RULES: dict[str, Callable[[State, Change], None]] = {
     "controls": _whole("controls"),
     "result": _whole("result"),
 }
+SNAPSHOT_KEYS = tuple(key for key in empty_state() if key != "sequence")
+"""The parts of a snapshot, besides its number."""
 KINDS = frozenset(_RULES) | {"reset"}
 """Kinds of change. `reset` says that so much is new (another mission) that clients get a snapshot instead."""
 

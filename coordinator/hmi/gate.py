@@ -24,8 +24,9 @@ class Gate:
     def __init__(self, server: web.Server, limit: int = CONNECTIONS, silent: float = SILENT_S) -> None:
         self._server = server
         self._limit = limit
-        self._silent = silent
+        self.silent = silent
         self._waiting: set[asyncio.BaseProtocol] = set()
+        self._coming = 0
         self.turned_away = 0
 
     def __call__(self) -> asyncio.Protocol:
@@ -35,13 +36,19 @@ class Gate:
             return _Turned()
         handler = self._server()
         self._waiting.add(handler)
-        asyncio.get_running_loop().call_later(self._silent, self._end_if_silent, handler)
+        self._coming += 1  # aiohttp counts it one turn of the loop later
+        loop = asyncio.get_running_loop()
+        loop.call_soon(self._came)
+        loop.call_later(self.silent, self._end_if_silent, handler)
         return handler
 
     @property
     def open_connections(self) -> int:
         """Connections that are open now."""
-        return len(self._server.connections)
+        return len(self._server.connections) + self._coming
+
+    def _came(self) -> None:
+        self._coming -= 1
 
     def asked(self, request: web.Request) -> None:
         """Note that a connection has sent a whole request head."""

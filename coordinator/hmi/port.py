@@ -33,30 +33,6 @@ VERBS = frozenset(
 """All commands. Anybody may say `estop`, `take_controls`, `ask_controls` and `release_controls` (a no-op for one who
 does not hold them); the others are for the holder of the controls."""
 
-SNAPSHOT_KEYS = (
-    "mission",
-    "time",
-    "task",
-    "marking",
-    "runs",
-    "ended",
-    "firings",
-    "nodes",
-    "events",
-    "variables",
-    "devices",
-    "images",
-    "setpoints",
-    "reports",
-    "notices",
-    "breakpoints",
-    "paused",
-    "controls",
-    "selectors",
-    "result",
-)
-"""What a snapshot holds besides `sequence`; `coordinator.hmi.changes.empty_state` gives each its empty value."""
-
 
 class MissionPort(Protocol):
     """A mission as the page sees it. All methods are called in the coordinator's own loop and give plain JSON data."""

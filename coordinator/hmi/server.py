@@ -17,6 +17,7 @@ from coordinator.hmi.gate import Gate
 from coordinator.hmi.house import HOUSE, House
 from coordinator.hmi.port import HistoryPort, MissionPort, OffersPort
 from coordinator.hmi.requests import LARGEST_BODY
+from coordinator.hmi.sessions import Session
 from coordinator.hmi.store import TaskStore
 
 PAGE_FILES = Path(__file__).parent / "page"
@@ -33,9 +34,20 @@ class Page:
         self.token = house.doors.token
 
     @property
-    def clients(self) -> int:
-        """How many clients are connected."""
-        return len(self._house.sessions)
+    def sessions(self) -> frozenset[Session]:
+        """The clients that are connected."""
+        return frozenset(self._house.sessions)
+
+    @property
+    def gate(self) -> Gate:
+        """Where connections come in."""
+        assert self._house.gate is not None
+        return self._house.gate
+
+    async def idle(self) -> None:
+        """Wait until no command is being carried out."""
+        while self._house.commands:
+            await asyncio.wait(set(self._house.commands))
 
     async def close(self) -> None:
         """Close all connections and the port; commands that are being carried out are given up."""

@@ -88,8 +88,6 @@ def told(stimulus: Stimulus | None, cause: str = "") -> str:
             return "the run began"
         case None:
             return cause
-        case _:
-            return type(stimulus).__name__
 
 
 def reason_of(status: Status | None, cause: str, text: str, executed: Executed) -> dict[str, Any]:

@@ -327,9 +327,7 @@ class Stage:
         while not self._over:
             await asyncio.sleep(BEAT_S)
             now = loop.time()
-            if self.feed.state["paused"] is None:
-                self.clock += now - last
-            elif any(not p.held for p in self._playing.values()):
+            if self.feed.state["paused"] is None or any(not p.held for p in self._playing.values()):
                 self.clock += now - last
             last = now
             self.advance(BEAT_S)

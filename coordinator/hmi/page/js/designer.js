@@ -13,6 +13,7 @@ import { Pointer } from "./pointer.js";
 import { toast } from "./toast.js";
 
 const CHECK_MS = 300;
+const NEARLY = 16;
 const TOOLS = [
   ["select", "select", "Select", "V"], ["action", "action", "Action place", "1"], ["resource", "resource", "Resource place", "2"],
   ["control", "control", "Control place", "3"], ["macro", "macro", "Macro place", "4"], ["transition", "transition", "Transition", "T"],
@@ -47,7 +48,7 @@ export class Designer {
   buildBars() {
     this.buttons = {};
     this.box = h("nav", { class: "toolbox", role: "toolbar", "aria-label": "Drawing tools", "aria-orientation": "vertical" }, TOOLS.map(([key, sign, label, letter]) => {
-      const button = h("button", { type: "button", class: "draw-tool", "aria-keyshortcuts": letter, "aria-pressed": "false", onclick: (event) => this.toolPressed(key, event) }, icon(sign), h("span", {}, label), h("kbd", {}, letter));
+      const button = h("button", { type: "button", class: "draw-tool", "aria-label": label, "aria-keyshortcuts": letter, "aria-pressed": "false", onclick: (event) => this.toolPressed(key, event) }, icon(sign), h("span", {}, label), h("kbd", {}, letter));
       this.buttons[key] = button;
       return button;
     }));
@@ -331,8 +332,15 @@ export class Designer {
     if (event.detail === 0 && !["select", "arc", "inhibit"].includes(key)) this.insertFree(key);
   }
 
+  /** Put a new element where the pointer says, in line with those that are nearly in line already. */
+  insertNear(kind, x, y) {
+    const all = [...this.view.elements.values()];
+    const near = (axis, value) => all.filter((e) => Math.abs(e[axis] - value) < NEARLY).sort((a, b) => Math.abs(a[axis] - value) - Math.abs(b[axis] - value))[0]?.[axis] ?? snap(value);
+    return this.insert(kind, near("x", x), near("y", y));
+  }
+
   insert(kind, x, y) {
-    const name = kind === "transition" ? this.model.addTransition(snap(x), snap(y)) : this.model.addPlace(kind, snap(x), snap(y));
+    const name = kind === "transition" ? this.model.addTransition(Math.round(x), Math.round(y)) : this.model.addPlace(kind, Math.round(x), Math.round(y));
     this.use("select");
     this.choose(new Set([name]));
     this.view.elements.get(name)?.node.focus({ preventScroll: true });

@@ -3,7 +3,7 @@
 import { s } from "./dom.js";
 import { at } from "./geometry.js";
 
-const FLIGHT_MS = 420; // into the transition and out of it, half each
+const HALF_MS = 210; // into the transition, and again out of it
 const AT_ONCE = 48;
 const SAME_ARC_MS = 140;
 
@@ -12,10 +12,8 @@ export class Flights {
     this.layer = layer;
     this.landed = landed;
     this.going = [];
-    this.free = [];
+    this.spare = [];
     this.lastOn = new WeakMap();
-    this.clock = 0;
-    this.before = 0;
     this.frame = 0;
     this.frozen = false;
     this.calm = matchMedia("(prefers-reduced-motion: reduce)");
@@ -23,23 +21,25 @@ export class Flights {
 
   /** Begin a flight; `second` is the half after the transition. False when it is left out: too many, or motion unwanted. */
   start(arc, second, failed) {
-    if (!this.frame && !this.frozen) this.clock += performance.now() - this.before;
-    if (!this.frame) this.before = performance.now();
-    const last = this.lastOn.get(arc) ?? -Infinity;
-    if (this.calm.matches || document.hidden || this.going.length >= AT_ONCE || this.clock - last < SAME_ARC_MS) return false;
-    this.lastOn.set(arc, this.clock);
-    const dot = this.free.pop() ?? s("circle", { r: 5.5 });
+    const now = performance.now();
+    const soon = now - (this.lastOn.get(arc) ?? -Infinity) < SAME_ARC_MS;
+    if (this.calm.matches || document.hidden || this.going.length >= AT_ONCE || soon) return false;
+    this.lastOn.set(arc, now);
+    const dot = this.spare.pop() ?? s("circle", { r: 5.5 });
     dot.setAttribute("class", failed ? "flight failed" : "flight");
     dot.setAttribute("visibility", "hidden");
     this.layer.append(dot);
-    this.going.push({ arc, dot, begins: this.clock + (second ? FLIGHT_MS / 2 : 0) });
+    // one that begins during a pause is the operator's own step: it is not held
+    this.going.push({ arc, dot, done: second ? -HALF_MS : 0, held: !this.frozen });
     this.wake();
     return true;
   }
 
   freeze(frozen) {
+    if (this.frozen === frozen) return;
     this.frozen = frozen;
-    if (!frozen) this.wake();
+    if (frozen) for (const flight of this.going) flight.held = true;
+    this.wake();
   }
 
   /** End all flights now, as after a snapshot. */
@@ -48,39 +48,45 @@ export class Flights {
   }
 
   wake() {
-    if (this.frame || this.frozen) return;
+    if (this.frame || !this.going.some((flight) => this.moves(flight))) return;
     this.before = performance.now();
     this.frame = requestAnimationFrame((now) => this.step(now));
   }
 
+  moves(flight) {
+    return !this.frozen || !flight.held;
+  }
+
   step(now) {
     this.frame = 0;
-    this.clock += Math.min(100, Math.max(0, now - this.before));
+    const passed = Math.min(100, Math.max(0, now - this.before));
     this.before = now;
-    const going = [];
-    for (const flight of this.going) {
-      const part = (this.clock - flight.begins) / (FLIGHT_MS / 2);
-      if (part >= 1) {
-        this.end(flight);
-        continue;
-      }
-      if (part >= 0) {
-        const [x, y] = at(flight.arc.curve, part);
-        flight.dot.setAttribute("transform", `translate(${x.toFixed(1)} ${y.toFixed(1)})`);
-        if (!flight.seen) {
-          flight.seen = true;
-          flight.dot.removeAttribute("visibility");
-        }
-      }
-      going.push(flight);
+    this.going = this.going.filter((flight) => this.advance(flight, passed));
+    if (this.going.some((flight) => this.moves(flight))) this.frame = requestAnimationFrame((next) => this.step(next));
+  }
+
+  /** False when the flight is over. */
+  advance(flight, passed) {
+    if (!this.moves(flight)) return true;
+    flight.done += passed;
+    if (flight.done >= HALF_MS) {
+      this.end(flight);
+      return false;
     }
-    this.going = going;
-    if (going.length && !this.frozen) this.frame = requestAnimationFrame((next) => this.step(next));
+    if (flight.done >= 0) {
+      const [x, y] = at(flight.arc.curve, flight.done / HALF_MS);
+      flight.dot.setAttribute("transform", `translate(${x.toFixed(1)} ${y.toFixed(1)})`);
+      if (!flight.seen) {
+        flight.seen = true;
+        flight.dot.removeAttribute("visibility");
+      }
+    }
+    return true;
   }
 
   end(flight) {
     flight.dot.remove();
-    this.free.push(flight.dot);
+    this.spare.push(flight.dot);
     this.landed(flight.arc);
   }
 }

@@ -364,6 +364,8 @@ export class NetView {
     const element = this.elements.get(name);
     if (!element) return false;
     const { clientWidth: w, clientHeight: h } = this.svg;
+    const [x, y] = [element.x * this.view.zoom + this.view.x, element.y * this.view.zoom + this.view.y];
+    if (this.view.zoom > 0.5 && x > 70 && x < w - 70 && y > 90 && y < h - 70) return true; // in good view already
     const zoom = Math.max(this.view.zoom, 0.9);
     this.look(w / 2 - element.x * zoom, h / 2 - element.y * zoom, zoom);
     return true;

@@ -16,6 +16,7 @@ const STATE_WORD = {
   idle: "Ready", preparing: "Preparing", running: "Running", stopping: "Stopping", paused: "Paused", success: "Success",
   failure: "Failure", error: "Error", aborted: "Aborted", stopped: "Emergency stop",
 };
+const PAUSE_WORD = { operator: "Paused by the operator", step: "Paused after one firing" };
 const HELD_WORD = { held: "held", cannot_hold: "cannot hold", stopped: "stopped", lost: "no answer" };
 
 /** What a pause was answered by each node, for people. */
@@ -100,8 +101,8 @@ export class Operator {
 
   showPause(state) {
     const { paused } = state;
-    const reason = paused?.reason ? `${paused.reason}. ` : "";
-    text(this.answer, paused ? `${reason}${heldWords(paused.nodes)}` : "");
+    const reason = PAUSE_WORD[paused?.reason] ?? (paused?.reason ? `Paused: ${words(paused.reason)}` : "Paused");
+    text(this.answer, paused ? [reason, heldWords(paused.nodes)].filter(Boolean).join(". ") : "");
   }
 
   showHolder(state) {

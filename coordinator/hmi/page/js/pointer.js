@@ -27,7 +27,7 @@ export class Pointer {
     view.svg.focus({ preventScroll: true });
     if (designer.tool === "arc" || designer.tool === "inhibit") return this.arcDown(event, element);
     if (designer.tool !== "select") {
-      designer.insert(designer.tool, ...view.at(event.clientX, event.clientY));
+      designer.insertNear(designer.tool, ...view.at(event.clientX, event.clientY));
       return true;
     }
     const arc = event.target.closest?.("[data-arc]");

@@ -1,0 +1,49 @@
+"""Every vendored file is the one that the list names, and nothing is fetched from elsewhere."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+PAGE = Path(__file__).parents[2] / "coordinator" / "hmi" / "page"
+VENDOR = PAGE / "vendor"
+LIST = tomllib.loads((VENDOR / "vendored.toml").read_text(encoding="utf-8"))
+OWN = sorted(p for p in PAGE.rglob("*") if p.suffix in (".js", ".css", ".html") and VENDOR not in p.parents)
+
+
+def test_each_file_is_the_one_that_was_taken() -> None:
+    """Hashes of all vendored files, none missing, none more; each library names its version and licence."""
+    listed = {}
+    for name, library in LIST.items():
+        assert library["version"] and library["licence"] and library["package"]
+        listed |= {f"{name}/{file}": digest for file, digest in library["sha256"].items()}
+    found = {
+        str(p.relative_to(VENDOR)): hashlib.sha256(p.read_bytes()).hexdigest()
+        for p in VENDOR.rglob("*")
+        if p.is_file() and p.name != "vendored.toml"
+    }
+    assert found == listed
+
+
+@pytest.mark.parametrize("path", OWN, ids=lambda p: p.name)
+def test_nothing_comes_from_elsewhere(path: Path) -> None:
+    """No address of another host, no markup built from text, no inline handler or style."""
+    text = path.read_text(encoding="utf-8")
+    addresses = [a for a in re.findall(r"https?://[^\s\"'`)]+", text) if "www.w3.org" not in a and "${" not in a]
+    assert addresses == []
+    for forbidden in ("innerHTML", "outerHTML", "insertAdjacentHTML", "document.write", "eval(", "new Function"):
+        assert forbidden not in text
+    if path.suffix == ".html":
+        assert not re.search(r"<(?:script|style)(?![^>]*(?:src|href))[^>]*>|\son\w+=|\sstyle=", text)
+
+
+@pytest.mark.parametrize("path", [p for p in OWN if p.suffix == ".js"], ids=lambda p: p.name)
+def test_modules_say_their_role_and_stay_short(path: Path) -> None:
+    """Each module begins with what it is for, and none grows beyond what one can read."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    assert lines[0].startswith("// ")
+    assert len(lines) <= 520
