@@ -23,6 +23,8 @@ from services.runs import Told, flat
 
 LINKED = "linked"
 """What the node says when it has passed the link of a new worker."""
+HALT = "halt"
+"""Verb of the node's own stop order, answered when the device stands still."""
 PRIORITY = 50
 """SCHED_FIFO priority, where the system permits it."""
 CATCH_UP = 5
@@ -118,9 +120,12 @@ class DeviceLoop:
             self._attach()
         elif items[0] == "command":
             _, id_, verb = items
-            if verb == "stop":
+            if verb == HALT:
                 self._driver.stop(now)
                 self._stopping[id_] = now + STOP_LIMIT
+            elif verb == "stop":
+                self._driver.stop(now)
+                self._tell(id_, "stopped" if self._driver.stopped() else "stopping")
             elif verb == "hold":
                 self._tell(id_, self._driver.hold(now))
             elif verb == "release":

@@ -36,6 +36,8 @@ class Outlets:
         numbers = tuple(float(v) for v in values)
         if not all(map(math.isfinite, numbers)):
             raise ValueError(f"set point of {stream!r} is not finite: {numbers}")
+        if stream not in self._open:
+            outlet.next = max(outlet.next, now)  # a pause is no delay to be made up for
         outlet.run, outlet.values, outlet.published = run, numbers, now
         self._open[stream] = outlet
 

@@ -15,7 +15,7 @@ from typing import Any
 from services.action import Status
 from services.child import Child
 from services.comm.messages import Executed
-from services.device_process import LINKED
+from services.device_process import HALT, LINKED
 from services.pipe import link_pair
 from services.runner import GRACE, STOP_LIMIT
 from services.runs import Begin, Ended, Hold, Order, Report, Stop, Told, flat, record
@@ -31,7 +31,6 @@ STABLE = 10.0
 """Seconds after which a process counts as well started."""
 NOT_READY = 10.0
 """Seconds that a call waits for a process that is being started."""
-_HALT = "halt"
 
 
 @dataclass
@@ -176,7 +175,7 @@ class WorkerPlace:
         if self._owner is not None and not self._closing:
             self._halts += 1
             self._halt_due = self._clock() + STOP_LIMIT + MARGIN
-            self._owner.post([COMMAND, f"{_HALT}{self._halts}", "stop"])
+            self._owner.post([COMMAND, f"{HALT}{self._halts}", HALT])
         else:
             self._tell_lost("")
         self._plan_restart()
@@ -276,7 +275,7 @@ class WorkerPlace:
         if since >= SILENT and not run.pong and not run.halted:
             run.halted = True
             if self._cyclic and self._owner is not None:
-                self._owner.post([COMMAND, _HALT, "stop"])
+                self._owner.post([COMMAND, HALT, HALT])
         patience = GRACE + STOP_LIMIT + MARGIN if run.pong else GRACE
         if since >= patience and not run.killed and self._worker is not None:
             run.killed = True
@@ -326,7 +325,7 @@ class WorkerPlace:
             self._worker.post(flat(Hold(frozen)))
 
     def _told(self, told: Told) -> None:
-        if told.id.startswith(_HALT):
+        if told.id.startswith(HALT):
             note = "" if told.answer == "stopped" else "the device is not known to stand still"
             self._tell_lost(note)
             return

@@ -390,8 +390,13 @@ def trace(places: Directory, script: Sequence[tuple[int, str, dict[str, Any]]]) 
     for caller in bench.coordinator.callers.values():
         caller.subscribe(0.0, ["beat", "memory:sum", "memory:count"])
     bench.run(1.0)
+    return trace_of(bench.coordinator)
+
+
+def trace_of(coordinator: Coordinator) -> list[tuple[Any, ...]]:
+    """All that a coordinator heard, with the tick, but for what belongs to a process."""
     rows: list[tuple[Any, ...]] = []
-    for tick, notice in bench.coordinator.heard:
+    for tick, notice in coordinator.heard:
         if isinstance(notice, Ended):
             o = notice.outcome
             values = {k: v for k, v in o.values.items() if k != "pid"}

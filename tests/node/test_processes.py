@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager
@@ -19,9 +20,13 @@ import pytest
 from services.comm.caller import Caller
 from services.comm.client import Client
 from services.comm.directory import Directory, parse
+from services.comm.lockstep import Member
 from services.comm.messages import Answer, Call, Command, Hello, Outcome
 from services.comm.notice import Accepted, Answered, EventArrived, Notice
 from tests.node.conftest import OUTSIDE
+from tests.node.test_lockstep import CALLS, Coordinator, World, trace_of
+from tests.node.test_lockstep import CELL as LOCKSTEP
+from tests.node.test_lockstep import Bench as LockstepBench
 
 pytestmark = pytest.mark.processes
 ROOT = Path(__file__).parents[2]
@@ -148,6 +153,17 @@ def select_nothing() -> None:
     select.select([], [], [], 0.01)
 
 
+def start_node(name: str, file: Path, *options: str) -> subprocess.Popen[str]:
+    """Launch a node as a process."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "services", name, "--services", str(file), *options],
+        env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{OUTSIDE}"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
 class Nodes:
     """The node processes of a cell."""
 
@@ -162,14 +178,7 @@ class Nodes:
             assert "ready" in line, f"{name}: {line!r}"
 
     def _start(self, name: str, mock: str) -> subprocess.Popen[str]:
-        extra = ["--mock", mock] if mock else []
-        return subprocess.Popen(
-            [sys.executable, "-m", "services", name, "--services", str(self.file), *extra],
-            env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{OUTSIDE}"},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+        return start_node(name, self.file, *(["--mock", mock] if mock else []))
 
     def stop(self) -> dict[str, int]:
         codes = {}
@@ -432,6 +441,42 @@ async def test_kill_9_of_a_node_ends_its_processes(tmp_path: Path) -> None:
 
         await operator.until(gone, 5.0)
     assert running.stop() == {"left": -9}
+
+
+def test_lock_step_in_four_processes_is_that_in_one(tmp_path: Path) -> None:
+    ports = {"left": free_port(), "right": free_port(), "world": free_port(), "coordinator": free_port()}
+    text = LOCKSTEP.replace("NODE", "right").replace(
+        "schema = 1\n", f"schema = 1\n[coordinator]\nport = {ports['coordinator']}\n"
+    )
+    for name, old in (("left", 7401), ("right", 7402), ("world", 7400)):
+        text = text.replace(f"port = {old}", f"port = {ports[name]}")
+    file = tmp_path / "services.toml"
+    file.write_text(text)
+    places = parse(text, file)
+    script: list[tuple[int, str, dict[str, Any]]] = [
+        (5 + 10 * n, service, arguments) for n, (service, arguments) in enumerate(CALLS)
+    ]
+    alone = LockstepBench(places, script)
+    alone.run(1.2)
+    nodes = [start_node(name, file, "--lockstep") for name in ("left", "right")]
+    coordinator, world = Coordinator(places, script), World(places)
+    parties: list[Any] = [coordinator, world]
+    members = [Member(p.name, [p], places.members(), directory=places.hash, patience=30.0) for p in parties]
+    threads = [threading.Thread(target=run_member, args=(member, 300)) for member in members]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    assert [process.wait(20) for process in nodes] == [0, 0]
+    for process in nodes:
+        process.communicate()
+    assert trace_of(coordinator) == trace_of(alone.coordinator)
+
+
+def run_member(member: Member, ticks: int) -> None:
+    """Be one party of a lock-step cell for so many ticks."""
+    member.open()
+    member.run(max_ticks=ticks)
 
 
 async def test_scripted_actions(tmp_path: Path) -> None:

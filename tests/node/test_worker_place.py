@@ -1,0 +1,344 @@
+"""How a node watches its processes: who is told what, when a hanging one is killed, and that every run ends once."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from services.pipe import NewestLink
+from services.runner import GRACE, STOP_LIMIT
+from services.runs import Answered, Begin, Ended, Hold, Order, Raised, Stop, Told, flat, record
+from services.worker import COMMAND, FAILED, PING, PONG, READY, STREAM_AT, WANTED, Setup
+from services.worker_place import MARGIN, NOT_READY, SILENT, WorkerPlace
+from tests.node.conftest import Clock
+
+
+class FakeChild:
+    """A child process that does what the test says."""
+
+    def __init__(self, setup: Setup, heard: Callable[[list[Any]], None], ended: Callable[[], None], link: Any) -> None:
+        self.setup = setup
+        self.say = heard
+        self._ended = ended
+        self.link = link
+        self.linked = link is not None
+        self._drop(link)
+        self.pid = id(self) % 10_000
+        self.got: list[list[Any]] = []
+        self.passed: list[socket.socket] = []
+        self.killed = self.left = False
+
+    def post(self, items: list[Any]) -> None:
+        self.got.append(items)
+
+    def _drop(self, end: socket.socket | None) -> None:
+        if end is not None:
+            end.close()
+
+    def pass_link(self, end: socket.socket, word: str) -> None:
+        self.passed.append(end)
+        self._drop(end)
+        self.post([word])
+
+    def kill(self) -> None:
+        self.killed = True
+
+    def leave(self) -> None:
+        self.left = True
+
+    def describe(self) -> str:
+        return "it was ended by SIGTEST"
+
+    def die(self) -> None:
+        self._ended()
+
+    def ready(self, period: float | None = None, **streams: int) -> None:
+        self.say([READY, {"period": period, "streams": streams, "fifo": False}])
+
+    def orders(self) -> list[Order]:
+        kinds = {"begin", "stop", "answered", "hold"}
+        return [record(items) for items in self.got if items[0] in kinds]  # type: ignore[misc]
+
+
+class KeepingChild(FakeChild):
+    """One that keeps its ends of sockets open."""
+
+    def _drop(self, end: socket.socket | None) -> None: ...
+
+
+class Bench:
+    """A place whose children are fake."""
+
+    def __init__(self, device: str = "arm", child: type[FakeChild] = FakeChild) -> None:
+        self.child = child
+        self.clock = Clock(100.0)
+        self.children: list[FakeChild] = []
+        self.wanted: list[str] = []
+        self.reports: list[Any] = []
+        setup = Setup("services.toml", "", "node", device)
+        self.place = WorkerPlace(
+            setup, clock=self.clock, changed=lambda: None, wanted=self.wanted.append, spawn=self._spawn
+        )
+        self.place.start()
+
+    def _spawn(self, *arguments: Any) -> Any:
+        self.children.append(self.child(*arguments))
+        return self.children[-1]
+
+    def cyclic(self) -> tuple[FakeChild, FakeChild]:
+        """Bring up driver and actions of a cyclic device."""
+        self.children[-1].ready(0.004, points=4711)
+        self.children[-1].ready()
+        return self.children[-2], self.children[-1]
+
+    def begin(self, identity: str = "r", deadline: float | None = None) -> None:
+        self.place.take(self.clock.now, Begin(identity, "act", {}, deadline))
+
+    def run(self, seconds: float) -> list[Any]:
+        """Advance exactly when it says that it is due, as the shell does."""
+        until, fresh = self.clock.now + seconds, []
+        while True:
+            self.place.advance(self.clock.now)
+            fresh += self.place.reports()
+            due = self.place.due()
+            if due is None or due > until:
+                break
+            self.clock.now = max(due, self.clock.now + 1e-6)
+        self.clock.now = max(until, self.clock.now)
+        self.reports += fresh
+        return fresh
+
+    def ended(self, identity: str = "r") -> Ended:
+        (end,) = [r for r in self.reports if isinstance(r, Ended) and r.id == identity]
+        return end
+
+
+def test_a_device_without_cycle_has_one_process() -> None:
+    bench = Bench()
+    (child,) = bench.children
+    assert (child.setup.device, bool(bench.place.ready)) == ("arm", False)
+    bench.begin()
+    assert child.orders() == []
+    child.ready()
+    assert bench.place.ready and child.orders() == [Begin("r", "act", {}, None)]
+    child.say(flat(Ended("r", "success", {"x": 1})))
+    bench.run(0.0)
+    assert bench.ended().values == {"x": 1} and bench.place.pids() == {"actions": child.pid}
+
+
+def test_a_cyclic_device_has_two_with_a_link_between_them() -> None:
+    bench = Bench(child=KeepingChild)
+    driver, actions = bench.cyclic()
+    assert bench.place.streams == {"points": 4711} and set(bench.place.pids()) == {"actions", "driver"}
+    near, far = NewestLink(driver.passed[0]), NewestLink(actions.link)
+    assert near.send([1]) and far.newest() == [1]
+    far.close()
+    near.close()
+
+
+def test_what_comes_up_passes_through() -> None:
+    bench = Bench("")
+    (child,) = bench.children
+    child.ready()
+    child.say(flat(Raised("r", "seen", {})))
+    child.say([WANTED, "points"])
+    bench.place.take(0.0, Answered("r/1", "success"))
+    bench.place.stream_at("points", "h", 1, "t")
+    assert bench.run(0.0) == [Raised("r", "seen", {})] and bench.wanted == ["points"]
+    assert child.got[-2:] == [flat(Answered("r/1", "success")), [STREAM_AT, "points", "h", 1, "t"]]
+
+
+@pytest.mark.parametrize("answers", [False, True])
+def test_a_run_that_does_not_end_at_its_deadline(answers: bool) -> None:
+    bench = Bench()
+    driver, actions = bench.cyclic()
+    begun = bench.clock.now
+    bench.begin(deadline=1.0)
+    bench.run(1.0)
+    assert actions.orders()[-1] == Stop("r", "deadline", "not over after 1 s") and actions.got[-1][0] == PING
+    if answers:
+        actions.say([PONG, 1])
+    bench.run(SILENT + 0.01)
+    assert ([COMMAND, "halt", "halt"] in driver.got) == (not answers), "the device is stopped first"
+    patience = GRACE + STOP_LIMIT + MARGIN if answers else GRACE
+    bench.run(patience - SILENT - 0.03)
+    assert not actions.killed
+    bench.run(0.05)
+    assert bool(actions.killed)
+    actions.die()
+    assert [c for c in driver.got if c[0] == COMMAND][-1][2] == "halt"
+    assert bench.run(0.0) == [], "a run ends when its device stands still, not before"
+    driver.say(flat(Told("halt1", "stopped")))
+    bench.run(0.0)
+    end = bench.ended()
+    assert (end.cause, end.executed) == ("deadline", "yes") and "its process was killed" in end.text
+    assert end.seconds == pytest.approx(bench.clock.now - begun, abs=0.1)
+
+
+@pytest.mark.parametrize("stops", [True, False])
+def test_a_dead_worker(stops: bool) -> None:
+    bench = Bench()
+    driver, actions = bench.cyclic()
+    bench.begin()
+    actions.die()
+    if stops:
+        driver.say(flat(Told("halt1", "stopped")))
+    bench.run(STOP_LIMIT + MARGIN + 0.01)
+    end = bench.ended()
+    assert (end.cause, end.executed) == ("worker_died", "unknown") and "SIGTEST" in end.text
+    assert ("not known to stand still" in end.text) == (not stops)
+    assert len(bench.children) == 3 and not driver.killed, "only the actions' process is started again"
+    bench.children[-1].ready()
+    bench.begin("next")
+    assert bench.children[-1].orders() == [Begin("next", "act", {}, None)]
+
+
+def test_a_dead_driver_takes_the_actions_with_it() -> None:
+    bench = Bench()
+    driver, actions = bench.cyclic()
+    bench.begin()
+    driver.die()
+    assert actions.killed
+    actions.die()
+    bench.run(1.0)
+    assert (bench.ended().cause, bench.ended().executed) == ("device_died", "unknown")
+    new_driver, _ = bench.cyclic()
+    assert new_driver is not driver and bench.place.ready
+
+
+def test_one_that_keeps_dying_is_started_more_and_more_slowly() -> None:
+    bench = Bench("")
+    starts = [bench.clock.now]
+    for _ in range(6):
+        bench.children[-1].die()
+        count = len(bench.children)
+        while len(bench.children) == count:
+            due = bench.place.due()
+            assert due is not None
+            bench.clock.now = max(bench.clock.now, due)
+            bench.place.advance(bench.clock.now)
+        starts.append(bench.clock.now)
+    pauses = [b - a for a, b in pairwise(starts)]
+    assert pauses == sorted(pauses) and pauses[0] == 0.0 and pauses[-1] >= 4.0
+
+
+def test_a_call_waits_for_a_starting_process_but_not_for_ever() -> None:
+    bench = Bench()
+    bench.children[0].say([FAILED, "no bus"])
+    bench.begin("short", 1.0)
+    bench.begin("long")
+    bench.run(1.1)
+    assert bench.ended("short").executed == "no"
+    bench.run(NOT_READY)
+    assert (bench.ended("long").cause, bench.ended("long").executed) == ("not_ready", "no")
+    assert "no bus" in bench.ended("long").text
+
+
+def test_hold_reaches_device_and_runs_and_moves_deadlines() -> None:
+    bench = Bench()
+    driver, actions = bench.cyclic()
+    bench.begin(deadline=1.0)
+    bench.place.command(bench.clock.now, "h", "hold")
+    assert driver.got[-1] == [COMMAND, "h", "hold"]
+    driver.say(flat(Told("h", "held")))
+    assert actions.orders()[-1] == Hold(True)
+    assert [type(r) for r in bench.run(10.0)] == [Told], "the deadline does not pass while it is held"
+    bench.place.command(bench.clock.now, "r", "release")
+    assert actions.orders()[-1] == Hold(False)
+    bench.run(0.9)
+    assert not [o for o in actions.orders() if isinstance(o, Stop)]
+    bench.run(0.2)
+    assert [o.cause for o in actions.orders() if isinstance(o, Stop)] == ["deadline"]
+
+
+def test_a_device_that_cannot_hold_goes_on() -> None:
+    bench = Bench()
+    driver, actions = bench.cyclic()
+    bench.place.command(bench.clock.now, "h", "hold")
+    driver.say(flat(Told("h", "cannot hold")))
+    assert not [o for o in actions.orders() if isinstance(o, Hold)]
+
+
+def test_stop_by_command() -> None:
+    bench = Bench()
+    driver, actions = bench.cyclic()
+    bench.begin()
+    bench.place.command(bench.clock.now, "s", "stop")
+    assert driver.got[-1] == [COMMAND, "s", "stop"]
+    assert actions.orders()[-1] == Stop("r", "stopped", "by command")
+
+
+def test_closing_lets_all_children_go() -> None:
+    bench = Bench()
+    driver, actions = bench.cyclic()
+    bench.place.close(bench.clock.now)
+    assert driver.left and actions.left
+    bench.run(60.0)
+    assert len(bench.children) == 2
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    acts=st.lists(
+        st.tuples(
+            st.sampled_from(
+                ["begin", "stop", "end", "pong", "die", "driver dies", "ready", "halted", "hold", "release"]
+            ),
+            st.integers(0, 3),
+            st.floats(0.0, 1.0),
+        ),
+        max_size=30,
+    )
+)
+def test_every_run_ends_exactly_once(acts: list[tuple[str, int, float]]) -> None:
+    bench = Bench()
+    bench.cyclic()
+    dead: set[int] = set()
+    begun: set[str] = set()
+    for act, number, pause in acts:
+        living = [c for c in bench.children if id(c) not in dead]
+        driver = next((c for c in living if not c.linked), None)
+        worker = next((c for c in living if c.linked), None)
+        identity = f"r{number}"
+        if act == "begin" and identity not in begun:
+            begun.add(identity)
+            bench.begin(identity, 1.0)
+        elif act == "stop":
+            bench.place.take(bench.clock.now, Stop(identity))
+        elif act == "end" and worker and identity in {o.id for o in worker.orders() if isinstance(o, Begin)}:
+            worker.say(flat(Ended(identity, "success")))
+        elif act == "pong" and worker:
+            worker.say([PONG, 1])
+        elif act == "die" and worker:
+            dead.add(id(worker))
+            worker.die()
+        elif act == "driver dies" and driver:
+            dead.add(id(driver))
+            driver.die()
+        elif act == "ready" and living:
+            living[-1].ready(0.004 if not living[-1].linked else None)
+        elif act == "halted" and driver:
+            driver.say(flat(Told("halt1", "stopped")))
+        elif act == "hold" and driver:
+            driver.say(flat(Told("nobody asked", "held")))
+        elif act == "release":
+            bench.place.command(bench.clock.now, "x", "release")
+        bench.run(pause)
+        for child in bench.children:
+            if child.killed and id(child) not in dead:
+                dead.add(id(child))
+                child.die()
+    for _ in range(40):
+        bench.run(1.0)
+        for child in bench.children:
+            if child.killed and id(child) not in dead:
+                dead.add(id(child))
+                child.die()
+    ends = [r.id for r in bench.reports if isinstance(r, Ended)]
+    assert len(ends) == len(set(ends)) and set(ends) == begun
