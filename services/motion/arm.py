@@ -68,16 +68,21 @@ class Settings:
         """From the device's table; keys that are not the arm's (node, driver, can, ...) are left alone. Raises ValueError."""
         fields = {name: config[name] for name in cls.__slots__ if name in config}
         for name, value in fields.items():
-            if isinstance(value, bool) is not isinstance(getattr(cls(), name), bool) or not isinstance(
-                value, str | int | float
-            ):
-                raise ValueError(f"services.toml: arm: {name} = {value!r} is of the wrong kind")
+            kind = type(getattr(_DEFAULTS, name))
+            fits = (
+                isinstance(value, int | float) and not isinstance(value, bool) if kind is float else type(value) is kind
+            )
+            if not fits:
+                raise ValueError(f"services.toml: arm: {name} = {value!r}: must be of type {kind.__name__}")
         settings = cls(**fields)
         if not 0.0 < settings.speed <= 1.0:
             raise ValueError(f"services.toml: arm: speed = {settings.speed}: must be above 0 and at most 1")
         if not settings.stream_period > 0.0:
             raise ValueError(f"services.toml: arm: stream_period = {settings.stream_period}: must be above 0")
         return settings
+
+
+_DEFAULTS: Final = Settings()
 
 
 class Arm:
@@ -343,7 +348,12 @@ class Arm:
             plan = self._follower.plan
             return plan is not None and self._off_by(plan.q) < NEAR_PLACE
         target = self._trajectory.target
-        return self._mode == "move" and target is not None and self._trajectory.arrived() and self._off_by(target) < IN_PLACE
+        return (
+            self._mode == "move"
+            and target is not None
+            and self._trajectory.arrived()
+            and self._off_by(target) < IN_PLACE
+        )
 
     def _off_by(self, q: Sequence[float]) -> float:
         return max(abs(a - b) for a, b in zip(q, self._measured, strict=True))

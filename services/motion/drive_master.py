@@ -44,6 +44,10 @@ RETRY: Final = 1.0
 """Seconds before a failed configuration is tried again."""
 RESET_CYCLES: Final = 10
 """Cycles between two fault resets."""
+STOP_CYCLES: Final = 125
+"""Cycles that a drive is given to stop quickly and stand, before its power is taken away and its brake holds."""
+SETTLE: Final = 0.05
+"""Seconds that nodes are given after a reset of their communication."""
 INPUT_TIMER_MS: Final = 100
 
 _U8, _U16, _U32, _I8, _I32 = Type.UNSIGNED8, Type.UNSIGNED16, Type.UNSIGNED32, Type.INTEGER8, Type.INTEGER32
@@ -95,10 +99,12 @@ class DriveLink:
         self.position = 0.0
         self.torque = 0.0
         self.silent = 0
+        self.spoken = False
         self.max_speed = 0.0
         self.error_code = 0
         self.controlword = 0
         self._wait = 0
+        self._stopping = 0
 
     def transfers(self, cycle: float) -> list[Transfer]:
         """The configuration of this drive for a bus cycle of so many seconds, and what is read from it."""
@@ -139,12 +145,15 @@ class DriveLink:
             raise ValueError(f"TPDO of node {self.node} has {len(data)} bytes, must have {_TPDO.size}")
         self.statusword, position, torque = _TPDO.unpack(data)
         self.state = state_of(self.statusword)
-        self.position, self.torque, self.silent = from_units(position), torque / 1e3, 0
+        self.position, self.torque = from_units(position), torque / 1e3
+        self.silent, self.spoken = 0, True
 
     def frame(self, target: float, wanted: bool, resetting: bool) -> Frame:
         """The RPDO: a controlword that leads to where the master wants the drive, and the target position (rad)."""
+        self._stopping = 0 if wanted else self._stopping + 1
         if not wanted:
-            command = Command.QUICK_STOP if self.state in _MOVING else Command.DISABLE_VOLTAGE
+            brakes = self.state in _MOVING and self._stopping <= STOP_CYCLES
+            command = Command.QUICK_STOP if brakes else Command.DISABLE_VOLTAGE
         elif self.state is State.FAULT:
             self._wait = (self._wait + 1) % RESET_CYCLES
             command = Command.FAULT_RESET if resetting and self._wait == 1 else Command.DISABLE_VOLTAGE
@@ -174,6 +183,7 @@ class DriveMaster:
         self._by_tpdo = {canopen.TPDO1_BASE + drive.node: drive for drive in self.drives}
         self._heard = dict.fromkeys([*(drive.node for drive in self.drives), inputs], 0.0)
         self._begin_at: float | None = 0.0
+        self._settled_at = 0.0
         self._beat_due = 0.0
         self._resetting = False
         self._enable_first = enable
@@ -194,12 +204,14 @@ class DriveMaster:
         return any(drive.statusword & StatusBit.INTERNAL_LIMIT for drive in self.drives)
 
     def reset(self, now: float) -> None:
-        """Forget troubles, reset faults, configure again."""
+        """Forget troubles, reset faults and enable again; configure again if the bus was the trouble."""
+        again = self.phase is not Phase.RUNNING or any(trouble.cause == "bus" for trouble in self.troubles)
         self.troubles.clear()
         self._resetting, self.wanted = True, True
         for drive in self.drives:
             drive.error_code = 0
-        self.phase, self._begin_at = Phase.CONFIGURING, now
+        if again:
+            self.phase, self._begin_at = Phase.CONFIGURING, now
 
     def give_up(self, why: str) -> None:
         """The servo itself finds that the drives do not follow: stop them."""
@@ -251,11 +263,13 @@ class DriveMaster:
         if self._begin_at is not None:
             if now < self._begin_at:
                 return []
-            self._begin_at = None
+            self._begin_at, self._settled_at = None, now + SETTLE
             for drive in self.drives:
                 drive.sdo.begin(drive.transfers(self.cycle))
             self._input_sdo.begin(self._input_transfers())
-            return [canopen.nmt(NmtCommand.ENTER_PREOPERATIONAL)]
+            return [canopen.nmt(NmtCommand.RESET_COMMUNICATION)]
+        if now < self._settled_at:
+            return []
         if any(client.busy for client in clients):
             return [frame for client in clients for frame in client.advance(now)]
         return self._start(now, clients)
@@ -274,7 +288,7 @@ class DriveMaster:
             self.troubles.clear()
         self.phase = Phase.STARTING
         for drive in self.drives:
-            drive.silent = 0
+            drive.silent, drive.spoken = 0, False
         self._heard = dict.fromkeys(self._heard, now)
         return [canopen.nmt(NmtCommand.START)]
 
@@ -293,12 +307,12 @@ class DriveMaster:
             drive.silent += 1
             if drive.silent == SILENT_CYCLES + 1:
                 self._report(Trouble("bus", drive.node - 1, 0, f"drive {drive.node} is silent"))
-            if drive.state is State.FAULT and not self._resetting and drive.silent <= 1:
+            if drive.state is State.FAULT and not self._resetting and drive.spoken and drive.silent <= 1:
                 self._fault(drive, drive.error_code)
         for node, heard in self._heard.items():
             if now - heard > HEARTBEAT_PATIENCE_MS / 1e3:
                 self._report(Trouble("bus", None, 0, f"node {node} sends no heartbeat"))
-        if self.phase is Phase.STARTING and all(drive.silent <= 1 for drive in self.drives):
+        if self.phase is Phase.STARTING and all(drive.spoken for drive in self.drives):
             self.phase = Phase.RUNNING
         if self.enabled:
             self._resetting = False
@@ -321,7 +335,9 @@ class DriveMaster:
         if 1 <= message.node <= len(self.drives):
             drive = self.drives[message.node - 1]
             drive.error_code = message.code
-            if message.code:
+            if (
+                message.code and self.phase is not Phase.CONFIGURING
+            ):  # before, it may be old; a fault that stays will show
                 self._fault(drive, message.code)
 
     def _fault(self, drive: DriveLink, code: int) -> None:

@@ -91,7 +91,8 @@ SLOWEST = 0.05
 class Trajectory:
     """The commanded motion of the arm's joints, advanced by one period a call. Angles in rad, speeds in rad/s.
 
-    `target` None means: come to rest. Limits may be changed at any time; a joint beyond new limits brakes into them.
+    `target` None means: come to rest. Limits may be changed at any time; a joint beyond new limits brakes into them. Braking to
+    rest always uses the accelerations given first.
     """
 
     def __init__(
@@ -101,6 +102,7 @@ class Trajectory:
         self.q = [float(value) for value in q]
         self.qd = [0.0] * len(self.q)
         self.target: list[float] | None = None
+        self._brakes = [float(value) for value in acceleration]
         self.limit(speed, acceleration)
 
     def limit(self, speed: Sequence[float], acceleration: Sequence[float]) -> None:
@@ -134,13 +136,13 @@ class Trajectory:
     def braking(self) -> tuple[list[float], list[float]]:
         """Position and velocity at the end of the next cycle when all joints brake."""
         period = self.period
-        after = [braking_velocity(v, period, a) for v, a in zip(self.qd, self.acceleration, strict=True)]
+        after = [braking_velocity(v, period, a) for v, a in zip(self.qd, self._brakes, strict=True)]
         return [q + 0.5 * period * (v + w) for q, v, w in zip(self.q, self.qd, after, strict=True)], after
 
     def resting(self, q: Sequence[float], qd: Sequence[float]) -> list[float]:
         """Where all joints come to rest if they brake from here."""
         period = self.period
-        return [angle + braking_distance(v, period, a) for angle, v, a in zip(q, qd, self.acceleration, strict=True)]
+        return [angle + braking_distance(v, period, a) for angle, v, a in zip(q, qd, self._brakes, strict=True)]
 
     def accept(self, q: list[float], qd: list[float]) -> None:
         """Make a proposed or braking state the present one."""

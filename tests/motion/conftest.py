@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 import tomllib
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
 from importlib.resources import files
 from typing import Any
 
 import numpy as np
 import pytest
 
+from services.action import Cancelled, Result, Wait
 from services.comm.canbus import Frame
 from services.motion.arm import PERIOD, Arm
 from services.motion.model import nominal_arm
@@ -229,3 +230,94 @@ def make_plant() -> Callable[[], SimplePlant]:
 def make_rig() -> type[Rig]:
     """For rigs that are not the usual one."""
     return Rig
+
+
+class FakeRemote:
+    """The arm as its actions see it: commands are taken, and states published, once a cycle."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._rig = rig
+        self.sent: list[Mapping[str, Any]] = []
+        self.handled = 0
+        self.refused = ""
+        self.state: Mapping[str, Any] = rig.arm.state()
+        self._published = rig.now
+
+    @property
+    def age(self) -> float:
+        return self._rig.now - self._published
+
+    def send(self, body: Mapping[str, Any]) -> int:
+        self.sent.append(dict(body))
+        return len(self.sent)
+
+    def cycle(self) -> None:
+        """What the node does between cycles."""
+        while self.handled < len(self.sent):
+            self.refused = ""
+            try:
+                self._rig.arm.command(self._rig.now, self.sent[self.handled])
+            except ValueError as reason:
+                self.refused = str(reason)
+            self.handled += 1
+        self._rig.tick()
+        self.state, self._published = self._rig.arm.state(), self._rig.now
+
+
+class Play:
+    """Runs an action on a rig; also the action's context."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig = rig
+        self.device = FakeRemote(rig)
+        self.run = "test"
+
+    @property
+    def now(self) -> float:
+        return self.rig.now
+
+    def wait(self, ready: Callable[[], bool], timeout: float | None = None) -> Wait:
+        return Wait(ready, None if timeout is None else self.now + timeout)
+
+    def sleep(self, seconds: float) -> Wait:
+        return Wait(lambda: False, self.now + seconds)
+
+    def play(
+        self,
+        action: Coroutine[Any, Any, Result],
+        each: Callable[[Play], None] | None = None,
+        cancel: Callable[[], bool] | None = None,
+        most: float = 20.0,
+    ) -> Result | None:
+        """To the action's end; `each` acts as the world in each cycle. None if `cancel` came true and ended it."""
+        wait: Wait = action.send(None)
+        until = self.now + most
+        while self.now < until:
+            if each is not None:
+                each(self)
+            self.device.cycle()
+            if cancel is not None and cancel():
+                with pytest.raises(Cancelled):
+                    action.throw(Cancelled())
+                self.device.cycle()
+                return None
+            if wait.ready() or (wait.due is not None and self.now >= wait.due - 1e-9):
+                try:
+                    wait = action.send(None)
+                except StopIteration as over:
+                    self.device.cycle()
+                    result: Result = over.value
+                    return result
+        raise AssertionError(f"the action did not end in {most} s: {self.device.state}")
+
+
+@pytest.fixture
+def play(rig: Rig) -> Play:
+    """Runs actions on an enabled arm at home."""
+    return Play(rig)
+
+
+@pytest.fixture
+def make_play() -> type[Play]:
+    """For rigs that are not the usual one."""
+    return Play
