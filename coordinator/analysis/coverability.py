@@ -11,6 +11,7 @@ Source: R. M. Karp, R. E. Miller, Parallel program schemata, J. Comput. Syst. Sc
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -118,10 +119,10 @@ class _Node:
 
 
 class _Tree:
-    """The Karp-Miller tree, depth first; a marking that any node has already expanded is not expanded again.
+    """The Karp-Miller tree, breadth first, so that chains of ancestors stay short.
 
-    The same marking roots the same subtree of markings, so leaving it out loses no bound; omega itself is only ever
-    introduced by comparison with ancestors.
+    A marking that any node has already expanded is not expanded again: the same marking roots the same subtree, so leaving
+    it out loses no bound; omega itself is only ever introduced by comparison with ancestors.
     """
 
     def __init__(self, net: Net, real: int) -> None:
@@ -132,9 +133,9 @@ class _Tree:
     def grow(self, effort: int, first_omega: bool) -> bool:
         """Build the tree; False if the effort ran out."""
         expanded: set[Marking] = set()
-        stack = [0]
-        while stack:
-            i = stack.pop()
+        queue = deque([0])
+        while queue:
+            i = queue.popleft()
             if self.nodes[i].marking in expanded:
                 continue
             expanded.add(self.nodes[i].marking)
@@ -147,7 +148,7 @@ class _Tree:
                 self._add(i, t, after)
                 if self.omega is not None and first_omega:
                     return True
-                stack.append(len(self.nodes) - 1)
+                queue.append(len(self.nodes) - 1)
         return True
 
     def _fire(self, marking: Marking, t: int) -> Marking | None:

@@ -76,10 +76,7 @@ def examine(
     `final` tells the designed ends: a dead marking that is not final is a deadlock. `cover` is a coverability result if
     one is at hand; it is computed when the space is not complete.
     """
-    net = space.net
     graph = Graph(len(space), space.source, space.target)
-    if not space.complete and cover is None:
-        cover = coverability(net, first_omega=True)
     bounds, bounded, safe = _boundedness(space, cover)
     ends = space.where(final) if final else np.zeros(len(space), dtype=np.bool_)
     dead = space.dead[~ends[space.dead]]
@@ -119,17 +116,19 @@ def _boundedness(space: Space, cover: Coverability | None) -> tuple[tuple[int | 
         most = max(space.bounds, default=0)
         bounded = Verdict(True, f"no place ever holds more than {most} token{'s' * (most != 1)}", assumption=SAFETY)
         return bounds, bounded, _safe(space, True)
-    assert cover is not None
     proven = place_bounds(space.net)
+    if all(b is not None for b in proven):
+        bounded = Verdict(True, f"bounded by invariants and capacities, although {space.reason}", assumption=SAFETY)
+        return tuple(proven), bounded, _safe(space, max(b or 0 for b in proven) <= 1)
+    cover = cover or coverability(space.net, first_omega=True, bounds=proven)
     known = [b if b is not None else c for b, c in zip(proven, cover.bounds, strict=True)]
     if cover.bounded is False:
         shown = Witness(cover.prefix, _marked(space.net, cover.prefix), cover.pump)
         reason = f"{', '.join(cover.grows)} can grow without end: {' '.join(cover.pump)} can be repeated for ever"
         settled = tuple(b if cover.complete else p for b, p in zip(known, proven, strict=True))
         return settled, Verdict(False, reason, shown), Verdict(False, reason, shown)
-    if cover.bounded or all(b is not None for b in known):
-        how = "the coverability tree" if cover.bounded else "invariants and capacities"
-        bounded = Verdict(True, f"bounded by {how}, although {space.reason}", assumption=SAFETY)
+    if cover.bounded:
+        bounded = Verdict(True, f"bounded by the coverability tree, although {space.reason}", assumption=SAFETY)
         return tuple(known), bounded, _safe(space, max(b or 0 for b in known) <= 1)
     return tuple(known), _unknown(space, cover.reason), _safe(space, False)
 
