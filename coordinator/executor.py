@@ -261,6 +261,8 @@ class Executor:
 
     def advance(self, now: float) -> None:
         """Fire the timers that are over, and start what waited for a fence."""
+        if not self._timers and not self._fences:
+            return
         for key in [k for k, t in self._timers.items() if t.held is None and t.due <= now]:
             del self._timers[key]
             self._queue.append(TimerFired(key))

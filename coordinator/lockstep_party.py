@@ -39,7 +39,9 @@ class CoordinatorParty:
         mission, self._now = self.mission, now
         for node, caller in mission.callers.items():
             caller.advance(now)
-            mission.take(now, node, caller.notices())
+            if notices := caller.notices():
+                mission.take(now, node, notices)
+        mission.advance(now)
         if mission.stage is Stage.CONNECTING and all(caller.up for caller in mission.callers.values()):
             mission.start(now)
         if self._watch is not None:

@@ -125,7 +125,6 @@ class Mission:
 
     def start(self, now: float) -> None:
         """The nodes are there: prepare the cell, or begin at once when nothing is to be prepared."""
-        self.executor.subscribe(now)
         if not self._ask(now, "prepare", self.executor.task.prepare, self._preparation()):
             self._begin(now)
         else:
@@ -184,6 +183,7 @@ class Mission:
 
     def _begin(self, now: float) -> None:
         self.stage, self.begun = Stage.RUNNING, now
+        self.executor.subscribe(now)
         self.executor.stimulate(now, Begin(self.parameters))
 
     def _finish(self, now: float) -> None:
