@@ -79,12 +79,12 @@ class Surface:
 class Predictor(Protocol):
     """Takes places one by one and predicts at any time. Costs the same for every observation."""
 
-    @property
-    def count(self) -> int:
-        """Observations taken."""
+    count: int
+    """Observations taken."""
 
     def add(self, time: float, x: float, y: float, sigma: float | None = None) -> None:
-        """Take the place where the ball was seen, with its standard deviation (m; None: the surface's); times rise."""
+        """Take the place (m) where the ball was seen at a time (s, rising), with its standard deviation (m; None: the
+        surface's)."""
 
     def place(self, time: float) -> Array:
         """Where the ball is expected (2,). Needs two observations."""

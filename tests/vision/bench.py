@@ -115,7 +115,7 @@ class Bench:
     """s after the release: somebody takes the ball away."""
     dead_from: float = float("inf")
     """s: the camera dies."""
-    arm: tuple[Sequence[Any], Sequence[float]] | None = None
+    arm: tuple[Array, Sequence[float]] | None = None
     cup: Array | None = None
     now: float = 0.0
     images: MemoryImages = field(init=False)

@@ -178,14 +178,17 @@ def test_known_resistance_is_taken_for_known() -> None:
 @pytest.mark.parametrize("make", [LeastSquares, Kalman])
 def test_coarse_places_count_less(make: Callable[[Surface], Predictor]) -> None:
     """Coarse places at the beginning (from a coarse locator) do not spoil the fine ones that follow."""
-    ball, spoiled, plain = Ball((2.12, 0.0), (0.62, 0.1), 1.8), [], []
+    ball = Ball((2.12, 0.0), (0.62, 0.1), 1.8)
+    spoiled: list[float] = []
+    plain: list[float] = []
     for seed in range(20):
         for told, found in ((0.004, spoiled), (None, plain)):
             rng = np.random.default_rng(seed)
             predictor = make(SURFACE)
             for k in range(14):
                 sigma = 0.004 if k < 4 else NOISE
-                predictor.add(0.02 * k, *(ball.place(0.02 * k) + rng.normal(0, sigma, 2)), told if k < 4 else None)
+                x, y = ball.place(0.02 * k) + rng.normal(0, sigma, 2)
+                predictor.add(0.02 * k, x, y, told if k < 4 else None)
             exit_ = predictor.exit()
             assert exit_ is not None
             found.append(exit_.time - ball.leaves()[0])
@@ -204,7 +207,8 @@ def test_cost_of_an_observation_does_not_grow() -> None:
 
 
 def test_gap_of_the_surface() -> None:
-    assert SURFACE.gap(np.array([1.62, 0.0]), np.array([-1.0, 0.0])) == (pytest.approx(1.0), Way.NEAR_EDGE)
+    gap, way = SURFACE.gap(np.array([1.62, 0.0]), np.array([-1.0, 0.0]))
+    assert way is Way.NEAR_EDGE and gap == pytest.approx(1.0)
     gap, way = SURFACE.gap(np.array([1.62, 0.0]), np.array([-0.6, 0.8]))
-    assert (gap, way) == (pytest.approx(0.45 / 0.8), Way.SIDE)
+    assert way is Way.SIDE and gap == pytest.approx(0.45 / 0.8)
     assert SURFACE.gap(np.array([1.62, 0.0]), np.array([1.0, 0.0])) == (float("inf"), Way.STAYS)

@@ -1,0 +1,122 @@
+"""The camera's driver: its config, its duties towards the node, and images that it hands out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from services.action import Result, Status
+from services.comm.image import Image
+from services.vision.calibration_file import DEFAULT, CalibrationFileError
+from services.vision.camera import CELL, Camera, CameraError
+from services.vision.location import FixedThreshold
+from tests.vision.bench import Bench, BenchContext, BenchPorts, run_action
+
+
+def test_shipped_files_are_the_default_and_others_can_be_named(bench: Bench) -> None:
+    usual = Camera({}, BenchPorts(bench))
+    calibration = DEFAULT.read_bytes().replace(b"focal_px = [6", b"focal_px = [7")
+    cell = CELL.read_bytes().replace(b"near_edge = 0.62", b"near_edge = 0.70")
+    other = Camera(
+        {"calibration": "lab.toml", "cell": "cell.toml"},
+        BenchPorts(bench, {"lab.toml": calibration, "cell.toml": cell}),
+    )
+    assert other.calibration.optics.focal[0] == usual.calibration.optics.focal[0] + 100
+    assert (usual.view.near_edge, other.view.near_edge) == (0.62, 0.70)
+    assert usual.usual_rate == 50.0
+    assert usual.period is None
+
+
+@pytest.mark.parametrize(
+    ("config", "files", "error", "text"),
+    [
+        ({"rate": 0}, {}, CameraError, "rate = 0.0 images/s"),
+        ({"rate": 5000}, {}, CameraError, "between 0 and 1000"),
+        ({"cell": "cell.toml"}, {"cell.toml": b"[table"}, CameraError, "cell.toml: no TOML"),
+        (
+            {"calibration": "lab.toml"},
+            {"lab.toml": b"schema = 1"},
+            CalibrationFileError,
+            "lab.toml: key 'lens' is missing",
+        ),
+    ],
+)
+def test_bad_config_is_refused_with_name_and_remedy(
+    bench: Bench, config: dict[str, Any], files: dict[str, bytes], error: type[Exception], text: str
+) -> None:
+    with pytest.raises(error, match=text.replace(".", r"\.")):
+        Camera(config, BenchPorts(bench, files))
+
+
+def test_duties_towards_the_node(context: BenchContext) -> None:
+    camera = context.device
+    assert camera.stopped() and camera.hold(0.0) == "held"
+    assert camera.start()
+    assert not camera.stopped() and camera.hold(0.0) == "cannot hold"
+    assert not camera.start(), "goes on at that rate already"
+    assert camera.start(25.0) and camera.rate == 25.0
+    camera.step(0.0)
+    camera.release(0.0)
+    camera.stop(0.0)
+    camera.stop(0.0)
+    assert camera.stopped()
+    assert camera.state() == {"rate": 0.0, "images": 0, "background_images": 0}
+    with pytest.raises(ValueError, match="no commands"):
+        camera.command(0.0, {"verb": "zoom"})
+    camera.close()
+
+
+def test_read_gives_the_newest_image_once(context: BenchContext) -> None:
+    camera = context.device
+    camera.start(50.0)
+    got: list[Image | None] = []
+
+    async def reading() -> Result:
+        await context.sleep(0.2)
+        got.append(await camera.read(context, 1.0))
+        got.append(await camera.read(context, 1.0))
+        camera.end()
+        got.append(await camera.read(context, 0.1))
+        return Result(Status.SUCCESS)
+
+    run_action(context.bench, reading())
+    first, second, last = got
+    assert first is not None and second is not None and last is None
+    assert first.sequence >= 8, "older ones are dropped"
+    assert second.sequence == first.sequence + 1
+    assert camera.time_of(first.sequence) == first.time
+    assert camera.time_of(first.sequence - 1) is None
+    assert second.time - first.time == pytest.approx(0.02, abs=0.0041)
+
+
+def test_detectors_are_made_once(context: BenchContext) -> None:
+    camera = context.device
+    first = camera.detector("threshold", lambda: FixedThreshold(camera.view))
+    assert camera.detector("threshold", lambda: FixedThreshold(camera.view)) is first
+
+
+def test_a_source_that_cannot_be_opened_is_no_image(context: BenchContext) -> None:
+    from services.vision import actions
+
+    class Unplugged:
+        def start(self, rate: float) -> None:
+            raise ConnectionError("camera source 3 cannot be opened")
+
+        def stop(self) -> None: ...
+
+        def newest(self) -> Image | None:
+            return None
+
+        def close(self) -> None: ...
+
+    class Ports(BenchPorts):
+        def images(self) -> Any:
+            return Unplugged()
+
+    camera = Camera({}, Ports(context.bench))
+    located = run_action(context.bench, actions.locate_background(BenchContext(context.bench, camera)))
+    assert (located.status, located.cause) == (Status.ERROR, "no_image")
+    assert "cannot be opened" in located.text
+    camera.background.learn(np.zeros((2, 2), np.uint8))

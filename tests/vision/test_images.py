@@ -1,0 +1,315 @@
+"""Images on the wire and from files: any cutting of the bytes, bad bytes, newest wins, restarts, devices that are not there."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.comm.camera import (
+    IMAGE_HEADER,
+    ImageDecoder,
+    ImageFormatError,
+    ImageServer,
+    MemoryImages,
+    StreamImages,
+    WireImage,
+    encode_image,
+    open_images,
+)
+from services.comm.capture import CaptureImages
+from services.comm.image import Image, ImageSource
+
+
+def grey(level: int, shape: tuple[int, int] = (48, 64)) -> np.ndarray:
+    return np.full(shape, level, np.uint8)
+
+
+def test_wire_format_byte_by_byte() -> None:
+    data = encode_image(WireImage(2, 7, 0.5, np.array([[1, 2, 3], [4, 5, 6]], np.uint8)))
+    assert data == bytes.fromhex("50494d47 00000002 0000000000000007 3fe0000000000000 0002 0003 00000006 010203040506")
+
+
+@given(cuts=st.lists(st.integers(0, 3 * (32 + 12)), max_size=8), take=st.booleans())
+def test_any_cutting_of_the_bytes(cuts: list[int], take: bool) -> None:
+    images = [WireImage(1, k, 0.01 * k, np.full((3, 4), k, np.uint8)) for k in range(3)]
+    data = b"".join(map(encode_image, images))
+    decoder, begin, seen = ImageDecoder(), 0, []
+    for end in [*sorted(cuts), len(data)]:
+        decoder.feed(data[begin : max(begin, end)])
+        begin = max(begin, end)
+        newest = decoder.take() if take else None
+        if newest is not None:
+            seen.append(newest.sequence)
+    last = decoder.take()
+    if last is not None:
+        seen.append(last.sequence)
+        assert np.array_equal(last.pixels, images[last.sequence].pixels)
+    assert seen == sorted(set(seen)) and seen[-1] == 2
+    assert take or seen == [2], "older ones are dropped"
+
+
+@given(st.binary(max_size=200))
+def test_random_bytes_leave_format_errors_only(data: bytes) -> None:
+    decoder = ImageDecoder()
+    try:
+        decoder.feed(data)
+    except ImageFormatError:
+        return
+    assert len(data) < IMAGE_HEADER.size or data.startswith(b"PIMG")
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        IMAGE_HEADER.pack(b"PIMG", 1, 1, 0.1, 4000, 5000, 20_000_000),
+        IMAGE_HEADER.pack(b"PIMG", 1, 1, 0.1, 4, 5, 21),
+        IMAGE_HEADER.pack(b"PIMG", 1, 1, -1.0, 4, 5, 20),
+        IMAGE_HEADER.pack(b"PIMG", 1, 1, float("nan"), 4, 5, 20),
+        IMAGE_HEADER.pack(b"JPEG", 1, 1, 0.1, 4, 5, 20),
+    ],
+)
+def test_impossible_headers_are_refused(header: bytes) -> None:
+    with pytest.raises(ImageFormatError):
+        ImageDecoder().feed(header)
+
+
+@pytest.fixture
+def server() -> Iterator[ImageServer]:
+    camera = ImageServer("127.0.0.1", 0)
+    yield camera
+    camera.close()
+
+
+@pytest.fixture
+def receiver(server: ImageServer) -> Iterator[StreamImages]:
+    images = StreamImages("127.0.0.1", server.port, time.monotonic)
+    yield images
+    images.close()
+
+
+def until(condition: Callable[[], object], *steps: Callable[[], object]) -> object:
+    """Repeat the steps until the condition holds; fails after ten seconds."""
+    deadline = time.monotonic() + 10.0
+    while time.monotonic() < deadline:
+        for step in steps:
+            step()
+        if (found := condition()) is not None and found is not False:
+            return found
+    raise AssertionError("it never came")
+
+
+def test_images_flow_at_the_asked_rate_and_stop(server: ImageServer, receiver: StreamImages) -> None:
+    receiver.start(40.0)
+    until(lambda: server.rate == 40.0, server.poll, receiver.newest)
+    sent = time.monotonic() - 0.125
+    server.send(grey(9), 0.125)
+    image = until(receiver.newest, server.poll)
+    assert isinstance(image, Image)
+    assert np.array_equal(image.pixels, grey(9))
+    assert image.time == pytest.approx(sent, abs=0.5) and image.time <= time.monotonic() - 0.125
+    assert receiver.newest() is None
+    receiver.stop()
+    until(lambda: server.rate == 0.0, server.poll)
+    server.send(grey(1), 0.0)
+    assert receiver.newest() is None
+
+
+def test_newest_wins_and_no_one_waits_for_a_slow_receiver(server: ImageServer, receiver: StreamImages) -> None:
+    """A receiver that does not read misses images; the camera goes on at once and memory does not grow."""
+    receiver.start(50.0)
+    until(lambda: server.rate > 0.0, server.poll, receiver.newest)
+    big = grey(0, (480, 640))
+    for k in range(200):
+        server.send(big + np.uint8(k), 0.0)
+    seen = []
+
+    def read() -> bool:
+        image = receiver.newest()
+        if image is not None:
+            seen.append(image)
+        return len(seen) > 0 and seen[-1].sequence >= 200
+
+    def send() -> None:
+        server.poll()
+        server.send(big, 0.0)
+
+    until(read, send)
+    assert len(seen) < 100, "not all of what was missed"
+    assert [image.sequence for image in seen] == sorted({image.sequence for image in seen})
+
+
+def test_images_of_an_earlier_start_are_dropped(server: ImageServer, receiver: StreamImages) -> None:
+    receiver.start(50.0)
+    until(lambda: server.rate > 0.0, server.poll, receiver.newest)
+    server.send(grey(1), 0.0)
+    receiver.stop()
+    receiver.start(25.0)
+    until(lambda: server.rate == 25.0, server.poll, receiver.newest)
+    server.send(grey(2), 0.0)
+    image = until(receiver.newest, server.poll)
+    assert isinstance(image, Image) and image.pixels[0, 0] == 2
+
+
+def test_a_camera_that_goes_away_is_found_again() -> None:
+    clock = [0.0]
+    first = ImageServer("127.0.0.1", 0)
+    port = first.port
+    receiver = StreamImages("127.0.0.1", port, lambda: clock[0])
+    receiver.start(50.0)
+    until(lambda: first.rate > 0.0, first.poll, receiver.newest)
+    first.close()
+    until(lambda: receiver._socket is None, receiver.newest)
+    assert receiver.newest() is None
+    second = ImageServer("127.0.0.1", port)
+    clock[0] += 1.0
+    until(lambda: second.rate == 50.0, second.poll, receiver.newest)
+    second.send(grey(5), 0.0)
+    assert until(receiver.newest, second.poll)
+    receiver.close()
+    second.close()
+
+
+def test_server_drops_who_speaks_nonsense(server: ImageServer) -> None:
+    import socket
+
+    with socket.create_connection(("127.0.0.1", server.port)) as stranger:
+        stranger.sendall(b"GET / HTTP/1.1\r\n\r\n")
+        stranger.setblocking(False)
+
+        def gone() -> bool:
+            try:
+                return stranger.recv(1) == b""
+            except BlockingIOError:
+                return False
+            except ConnectionError:
+                return True
+
+        until(gone, server.poll)
+    assert server.rate == 0.0
+
+
+def test_memory_images() -> None:
+    rates: list[float] = []
+    images = MemoryImages(rates.append)
+    images.put(Image(grey(1), 0.0, 0))
+    assert images.newest() is None, "not wanted yet"
+    images.start(50.0)
+    for k in range(3):
+        images.put(Image(grey(k), 0.02 * k, k))
+    newest = images.newest()
+    assert newest is not None and newest.sequence == 2
+    assert images.newest() is None
+    images.put(Image(grey(9), 1.0, 9))
+    images.close()
+    assert images.newest() is None
+    assert rates == [50.0, 0.0]
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ten pictures, each brighter than the last."""
+    path = tmp_path_factory.mktemp("film") / "film.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (64, 48))
+    assert writer.isOpened()
+    for k in range(10):
+        writer.write(np.full((48, 64, 3), 20 * k, np.uint8))
+    writer.release()
+    return path
+
+
+def test_a_file_is_paced_by_the_clock(film: Path) -> None:
+    clock = [100.0]
+    images: ImageSource = CaptureImages(str(film), lambda: clock[0])
+    assert images.newest() is None
+    for _ in range(2):  # a second start begins anew
+        images.start(25.0)
+        begin = clock[0]
+        first = images.newest()
+        assert first is not None and (first.sequence, first.time) == (0, begin)
+        assert images.newest() is None
+        clock[0] += 0.121
+        later = images.newest()
+        assert later is not None and later.sequence == 3
+        assert later.time == pytest.approx(begin + 0.12)
+        assert later.pixels.shape == (48, 64) and abs(float(later.pixels.mean()) - 60) < 6
+        clock[0] += 5.0
+        assert images.newest() is not None, "the last one"
+        assert images.newest() is None, "the film is over"
+    images.stop()
+    assert images.newest() is None
+    images.close()
+
+
+def test_a_device_is_grabbed_as_it_comes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A device's images come when they come; only the newest is kept, stamped when it came."""
+    given_out: list[int] = []
+
+    class Device:
+        def __init__(self, target: int) -> None:
+            assert target == 2
+
+        def isOpened(self) -> bool:  # noqa: N802 - OpenCV's name
+            return True
+
+        def set(self, key: int, value: float) -> None:
+            assert (key, value) == (cv2.CAP_PROP_FPS, 30.0)
+
+        def read(self) -> tuple[bool, np.ndarray]:
+            given_out.append(1)
+            return len(given_out) <= 5, np.dstack([grey(0), grey(100), grey(0)])
+
+        def release(self) -> None:
+            given_out.append(-1)
+
+    monkeypatch.setattr(cv2, "VideoCapture", Device)
+    images = CaptureImages(2, lambda: 7.0, latency=0.03)
+    images.start(30.0)
+    until(lambda: len(given_out) > 5)
+    images._thread.join() if images._thread else None
+    image = images.newest()
+    assert image is not None and image.sequence == 4
+    assert image.time == pytest.approx(6.97)
+    assert image.pixels[0, 0] == 59, "green by ITU-R BT.601"
+    assert images.newest() is None, "unplugged: no more images"
+    images.close()
+    assert given_out[-1] == -1
+
+
+def test_what_cannot_be_opened_is_said(tmp_path: Path) -> None:
+    images = CaptureImages(str(tmp_path / "none.avi"), time.monotonic)
+    with pytest.raises(ConnectionError, match=r"none\.avi.*cannot be opened"):
+        images.start(25.0)
+
+
+@pytest.mark.parametrize(
+    ("config", "kind"),
+    [
+        ({"source": "sim", "address": "127.0.0.1:4810"}, StreamImages),
+        ({"source": "capture:0", "latency": 0.03}, CaptureImages),
+        ({"source": "file:balls.avi"}, CaptureImages),
+    ],
+)
+def test_sources_by_config(config: dict[str, object], kind: type) -> None:
+    assert isinstance(open_images(config, time.monotonic), kind)
+
+
+@pytest.mark.parametrize(
+    ("config", "text"),
+    [
+        ({}, "source = ''"),
+        ({"source": "sim"}, "needs address"),
+        ({"source": "sim", "address": "host"}, "needs address"),
+        ({"source": "capture:front"}, 'use "sim", "capture:NUMBER"'),
+        ({"source": "file:"}, 'use "sim"'),
+    ],
+)
+def test_bad_sources_are_refused_with_a_remedy(config: dict[str, object], text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        open_images(config, time.monotonic)
