@@ -219,12 +219,12 @@ class Laboratory:
             world.idle(now + TICK)
             bus.ball(world.barrier)
             return
-        world.begin(now, self._cup_now())
+        world.begin(now, self._cup_now)
         for step in range(1, steps + 1):
             bus.step(now + (step - 1) * dt, dt)
             if world.fine:
                 world.fine_step(now + step * dt, self._cup_now())
-        world.end(now + TICK, self._cup_now())
+        world.end(now + TICK, self._cup_now)
         bus.ball(world.barrier)
 
     def _cup_now(self) -> Frame3:

@@ -41,6 +41,16 @@ class Frame3(NamedTuple):
             o[2] + a * x[2] + b * y[2] + c * z[2],
         )
 
+    def local(self, p: tuple[float, float, float]) -> tuple[float, float, float]:
+        """A point given in the base frame, in this frame."""
+        x, y, z, o = self
+        a, b, c = p[0] - o[0], p[1] - o[1], p[2] - o[2]
+        return (
+            a * x[0] + b * x[1] + c * x[2],
+            a * y[0] + b * y[1] + c * y[2],
+            a * z[0] + b * z[1] + c * z[2],
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Link:

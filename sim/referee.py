@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from sim.course import Course, Outcome
 from sim.oracle import Oracle, Verdict
-from sim.world import Course, Outcome
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,13 +8,14 @@ lies still in a standing cup costs nothing. The light barrier and the closest ap
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
 from enum import StrEnum
 from typing import Any
 
+from services.comm.party import TICK
 from sim.ball import BallModel, BallState, TableMotion, fly
 from sim.contact import ContactSpace
+from sim.course import Barrier, Course, Outcome
 from sim.puma_model import Frame3
 from sim.thrower import Throw
 from sim.truth import Truth
@@ -23,10 +24,19 @@ _HAND_SPEED = 3.0
 """m/s, faster than the arm can carry the cup."""
 _AHEAD = 0.005
 """s, a little more than a tick: surfaces that can meet within it are near."""
+_GAIN = 1.0
+"""m/s, more than a falling ball gains until it must be looked at again."""
 _SETTLED = 0.05
-"""s that a ball must lie still in a cup that does not move before it is left alone."""
+"""s that a ball must lie still in a cup that hardly moves before it is left alone."""
+_CREEP = 0.005
+"""m/s (and tenths of rad/s) up to which a cup hardly moves: an arm that settles."""
+_STIRRED, _TILTED = 1e-4, 2e-4
+"""m and rad by which a cup has moved on before its ball is no longer taken to lie still in it."""
 _FLAT_SPEED = 0.02
 """m/s of vertical speed below which a ball on the table has stopped bouncing."""
+
+
+CupPose = Callable[[], Frame3]
 
 
 class Where(StrEnum):
@@ -40,64 +50,12 @@ class Where(StrEnum):
     """Lying still in the cup."""
 
 
-class Outcome(StrEnum):
-    """What became of a throw."""
-
-    ROLLING = "rolling"
-    """Not decided yet."""
-    CAUGHT = "caught"
-    MISSED = "missed"
-    DROPPED = "dropped"
-    """It was in the cup and left it while the cup stood upright."""
-
-
-@dataclass(slots=True)
-class Course:
-    """What was seen of one throw so far. Times are seconds after its release, lengths m, base frame."""
-
-    throw: Throw
-    released_at: float
-    outcome: Outcome = Outcome.ROLLING
-    exit_time: float = math.inf
-    """When the centre left the near edge; inf if it did not."""
-    exit_state: BallState | None = None
-    crossing: float = math.inf
-    """Least distance from the centre of the cup's mouth at which the ball's centre, once off the table, went through
-    the plane of the mouth from outside; inf if it never did."""
-    approach: float = math.inf
-    """Least distance of the ball's centre from the centre of the mouth."""
-    caught_at: float = math.inf
-    ended_at: float = math.inf
-    """When the ball was taken out of play."""
-
-    @property
-    def miss(self) -> float:
-        """How far from the middle of the mouth the ball came to it (m): in the plane of the mouth where it crossed that,
-        else its closest approach."""
-        return self.crossing if self.crossing < math.inf else self.approach
-
-
-@dataclass(slots=True)
-class _Barrier:
-    """A light barrier with a filter: its output follows what it sees after `delay` seconds without a change."""
-
-    delay: float
-    output: bool = False
-    _since: float = field(default=0.0)
-
-    def see(self, now: float, interrupted: bool) -> None:
-        if interrupted == self.output:
-            self._since = now
-        elif now - self._since >= self.delay:
-            self.output = interrupted
-            self._since = now
-
-
 class World:
     """One ball at most, where it is and what became of it. Times `now` are simulated seconds.
 
-    Each tick: `begin` with the cup's pose; while `fine` holds, `fine_step` once for each 1 ms with the cup's pose at the end of
-    that millisecond; then `end`.
+    Each tick: `begin`; while `fine` holds, `fine_step` once for each 1 ms with the cup's pose at the end of that millisecond;
+    then `end`. `begin` and `end` ask for the cup's pose only when the ball may be near it: a pose costs more than they do.
+    The same object means the same pose.
     """
 
     def __init__(self, cell: Mapping[str, Any], truth: Truth) -> None:
@@ -107,12 +65,13 @@ class World:
         self._settings = settings
         self._cup_wall = float(cell["cup"]["wall"])
         self._space = ContactSpace(self.model, truth.table, truth.cup, self._cup_wall, settings)
-        self._barrier = _Barrier(float(settings["cup"]["barrier_delay"]))
+        self._barrier = Barrier(float(settings["cup"]["barrier_delay"]))
         self.where = Where.ABSENT
         self.ball: BallState | None = None
         self.course: Course | None = None
         self._cup: Frame3 | None = None
-        self._rests_in: Frame3 | None = None
+        self._look_at = -math.inf
+        self._rest: tuple[Frame3, tuple[float, float, float]] | None = None
         self._height = self._aside = math.inf
         self._last = (0.0, 0.0)
         self._start_at = 0.0
@@ -159,20 +118,43 @@ class World:
 
     # One tick
 
-    def begin(self, now: float, cup: Frame3) -> None:
-        """Start of a tick at `now` with the cup at `cup` (origin: mouth centre, z out of the mouth)."""
-        self._cup = cup
+    def begin(self, now: float, cup: CupPose) -> None:
+        """Start of a tick at `now`; `cup` gives the cup's frame (origin: mouth centre, z out of the mouth)."""
         ball = self.ball
         if ball is None:
             return
         if self.where is Where.AT_REST:
-            if cup is not self._rests_in:
-                self._touch(ball)
+            self._ride(cup())
         elif self.where is Where.CONTACT:
-            if not self._near_cup(ball, cup):
+            self._cup = cup()
+            if self._gap(ball, self._cup) > self._way_within_tick(ball):
                 self._leave_contact(now, ball)
-        elif self._near_cup(ball, cup) or (self.where is Where.FLIGHT and self._near_table(ball)):
+        elif self.where is Where.FLIGHT and self._near_table(ball):
+            self._cup = cup()
             self._touch(ball)
+        elif now >= self._look_at:
+            self._look(now, ball, cup())
+
+    def _look(self, now: float, ball: BallState, cup: Frame3) -> None:
+        """Into the contact space if ball and cup may touch within the tick; else note when that must be asked again."""
+        self._cup = cup
+        spare = self._gap(ball, cup) - self._way_within_tick(ball)
+        if spare <= 0.0:
+            self._touch(ball)
+        else:
+            self._look_at = now + spare / (_norm(ball.velocity) + _GAIN + _HAND_SPEED)
+
+    def _ride(self, cup: Frame3) -> None:
+        """A ball at rest goes along with its cup until that really moves."""
+        if self._rest is None or self.ball is None or cup is self._cup:
+            return
+        (before, local), last = self._rest, self.ball.position
+        position = cup.point(local)
+        self._cup = cup
+        self.ball = BallState(position, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        if _distance(before.origin, cup.origin) > _STIRRED or _distance(before.z, cup.z) > _TILTED:
+            x, y, z = ((b - a) / TICK for a, b in zip(last, position, strict=True))
+            self._touch(BallState(position, (x, y, z), (0.0, 0.0, 0.0)))
 
     def fine_step(self, now: float, cup: Frame3) -> None:
         """A fine step that ends at `now` with the cup at `cup`."""
@@ -189,20 +171,24 @@ class World:
         """A tick up to `now` without a ball; the cup need not be known."""
         self._barrier.see(now, False)
 
-    def end(self, now: float, cup: Frame3) -> None:
+    def end(self, now: float, cup: CupPose) -> None:
         """End of a tick at `now`: what follows closed forms goes on to here."""
-        self._cup = cup
-        if self.ball is None:
+        course = self.course
+        if self.ball is None or course is None:
             self.idle(now)
             return
         if self.where is Where.TABLE:
             self._go_on_table(now)
         elif self.where is Where.FLIGHT and self._start is not None:
             self.ball = fly(self._start, now - self._start_at, self.model.gravity)
-        if self.where in (Where.TABLE, Where.FLIGHT):
-            self._watch(now, self.ball, cup)
-        elif self.where is Where.AT_REST:
+        if self.where is Where.AT_REST:
             self._barrier.see(now, True)
+        elif self.where is not Where.CONTACT:
+            if now >= self._look_at or course.exit_state is not None:
+                self._watch(now, self.ball, cup())
+            else:  # too far from the cup to matter
+                self._barrier.see(now, False)
+                self._height = math.inf
         self._end_of_course(now, self.ball)
 
     # Changes of regime
@@ -210,10 +196,10 @@ class World:
     def _roll(self, now: float, start: BallState) -> None:
         resistance = self.course.throw.rolling_resistance if self.course else 0.0
         self._motion = TableMotion(self.model, start, resistance)
-        self._start_at, self.where = now, Where.TABLE
+        self._start_at, self._look_at, self.where = now, -math.inf, Where.TABLE
 
     def _soar(self, now: float, start: BallState) -> None:
-        self._start, self._start_at, self.where = start, now, Where.FLIGHT
+        self._start, self._start_at, self._look_at, self.where = start, now, -math.inf, Where.FLIGHT
 
     def _touch(self, ball: BallState) -> None:
         self._space.put_ball(ball)
@@ -259,16 +245,18 @@ class World:
             self._touch(self.ball)
 
     def _settle(self, now: float, ball: BallState, before: Frame3, cup: Frame3) -> None:
-        still = (
-            before is cup and self._inside(ball, cup) and _norm(ball.velocity) < self._settings["ball"]["rest_speed"]
-        )
+        """A ball that lies still in a cup that hardly moves is left alone."""
+        still = _norm(ball.velocity) < self._settings["ball"]["rest_speed"] and self._inside(ball, cup)
+        if still and before is not cup:
+            creep = _CREEP * self.fine_dt
+            still = _distance(before.origin, cup.origin) < creep and _distance(before.z, cup.z) < 10.0 * creep
         if not still:
             self._still_since = None
         elif self._still_since is None:
             self._still_since = now
         elif now - self._still_since >= _SETTLED:
             self.where = Where.AT_REST
-            self._rests_in = cup
+            self._rest = cup, cup.local(ball.position)
             self.ball = BallState(ball.position, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
     # What is seen
@@ -284,7 +272,7 @@ class World:
         self._note_exit(now, ball, course)
         if course.outcome is Outcome.ROLLING:
             course.approach = min(course.approach, math.hypot(height, aside))
-            if self._height > 0.0 >= height and course.exit_state is not None:
+            if math.inf > self._height > 0.0 >= height and course.exit_state is not None:
                 share = self._height / (self._height - height)
                 course.crossing = min(course.crossing, self._aside + share * (aside - self._aside))
             if self._barrier.output:
@@ -325,15 +313,12 @@ class World:
         height, aside = _seen_from(cup, ball)
         return -self._truth.cup.depth < height < 0.0 and aside < self._truth.cup.radius
 
-    def _near_cup(self, ball: BallState, cup: Frame3) -> bool:
-        """Whether the ball may touch the cup, a solid cylinder here, within a tick."""
+    def _gap(self, ball: BallState, cup: Frame3) -> float:
+        """Distance between the ball and the cup, a solid cylinder here (m)."""
         height, aside = _seen_from(cup, ball)
-        half = self._truth.cup.depth / 2.0
-        gap = math.hypot(
-            max(abs(height + half) - half - self._cup_wall, 0.0),
-            max(aside - self._truth.cup.radius - self._cup_wall, 0.0),
-        )
-        return gap < self.model.radius + self._way_within_tick(ball)
+        half, wall = self._truth.cup.depth / 2.0, self._cup_wall
+        beyond = max(abs(height + half) - half - wall, 0.0)
+        return math.hypot(beyond, max(aside - self._truth.cup.radius - wall, 0.0)) - self.model.radius
 
     def _way_within_tick(self, ball: BallState) -> float:
         return _AHEAD * (_norm(ball.velocity) + _HAND_SPEED)
@@ -372,6 +357,10 @@ def _seen_from(cup: Frame3, ball: BallState) -> tuple[float, float]:
     rx, ry, rz = px - ox, py - oy, pz - oz
     height = rx * zx + ry * zy + rz * zz
     return height, math.sqrt(max(0.0, rx * rx + ry * ry + rz * rz - height * height))
+
+
+def _distance(a: tuple[float, float, float], b: tuple[float, float, float]) -> float:
+    return math.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
 
 
 def _norm(v: tuple[float, float, float]) -> float:

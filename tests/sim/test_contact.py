@@ -73,6 +73,23 @@ def test_restitution_is_what_was_asked_for(
         assert restitution - 0.02 < went / came < restitution + 0.045, (came, went)
 
 
+@pytest.mark.parametrize("angle", [0.0, math.pi / 8, 1.9, math.pi])
+def test_the_cup_has_its_size(space: ContactSpace, angle: float) -> None:
+    """A ball at rest lies 20 mm over the bottom; in a cup on its side, 20 mm from the wall's inner face."""
+    lying = rotation_from_vector(np.array([0.0, math.pi / 2, 0.0])) @ rotation_from_vector(np.array([0.0, 0.0, angle]))
+    for turn, places in ((np.eye(3), (0.0, -0.05)), (lying, (0.02, None))):
+        cup = frame(turn, np.array([0.0, 0.0, 0.5]))
+        inside = np.array(cup.origin) - 0.035 * turn[:, 2]
+        space.put_ball(BallState(tuple(inside.tolist()), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+        for _ in range(1500):
+            ball = space.step(cup, cup)
+        local = turn.T @ (np.array(ball.position) - cup.origin)
+        aside, height = places
+        # flat walls: a ball may also lie in an edge between two of them, 0.8 mm further out
+        assert aside - 2e-4 < math.hypot(local[0], local[1]) < aside + 1e-3
+        assert height is None or local[2] == pytest.approx(height, abs=2e-4)
+
+
 @pytest.mark.parametrize("share", [0.0, 0.4, 0.8])
 def test_sliding_on_the_table_agrees_with_the_closed_form(
     site: Site, space: ContactSpace, model: BallModel, share: float

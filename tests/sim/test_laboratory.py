@@ -15,10 +15,10 @@ import pytest
 from services.comm.channels import images_wanted
 from services.comm.messages import Executed
 from services.comm.party import TICK
+from sim.course import Outcome
 from sim.exposures import Exposures
 from sim.site import Site
 from sim.thrower import draw_throw
-from sim.world import Outcome
 
 REPOSITORY = Path(__file__).parents[2]
 Bench = Any

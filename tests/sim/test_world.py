@@ -11,10 +11,11 @@ import pytest
 
 from services.comm.party import TICK
 from sim.ball import BallState, TableMotion, fly
+from sim.course import Course, Outcome
 from sim.puma_model import Frame3
 from sim.site import Site
 from sim.thrower import Throw, draw_throw
-from sim.world import Course, Outcome, Where, World
+from sim.world import Where, World
 
 AWAY = Frame3((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (-0.5, 0.0, 0.3))
 
@@ -50,12 +51,12 @@ class Hand:
 
     def step(self, cup: Frame3) -> None:
         world = self.world
-        world.begin(self.now, cup)
+        world.begin(self.now, lambda: cup)
         for k in range(1, 5):
             if world.fine:
                 world.fine_step(self.now + 0.001 * k, cup)
         self.tick += 1
-        world.end(self.now, cup)
+        world.end(self.now, lambda: cup)
 
     def run(self, cup: Frame3, until: Callable[[], bool], at_most: float = 12.0) -> None:
         for _ in range(round(at_most / TICK)):
