@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import traceback
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +15,24 @@ _OURS = {
 }
 
 
+@lru_cache(maxsize=4096)
+def _parameters(function: Callable[..., Any]) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
+    """Names of a callable's parameters after the context, those without default, and whether it takes any name."""
+    parameters = list(inspect.signature(function).parameters.values())[1:]
+    named = [p for p in parameters if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    needed = tuple(p.name for p in named if p.default is p.empty)
+    return tuple(sorted(p.name for p in named)), needed, any(p.kind is p.VAR_KEYWORD for p in parameters)
+
+
 def check_arguments(function: Callable[..., Any], arguments: Mapping[str, Any]) -> None:
     """Raise TypeError that names the argument which does not fit and what would; the first parameter is the context."""
-    parameters = list(inspect.signature(function).parameters.values())[1:]
-    names = sorted(p.name for p in parameters if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD))
-    takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters)
+    names, needed, takes_any = _parameters(function)
     for name in arguments:
         if name not in names and not takes_any:
             raise TypeError(f"takes no argument {name!r}; it takes: {', '.join(names) or 'none'}")
-    for p in parameters:
-        if p.default is p.empty and p.name in names and p.name not in arguments:
-            raise TypeError(f"needs the argument {p.name!r}; give it as args in services.toml or in the task")
+    for name in needed:
+        if name not in arguments:
+            raise TypeError(f"needs the argument {name!r}; give it as args in services.toml or in the task")
 
 
 def describe(fault: BaseException) -> str:
