@@ -437,4 +437,4 @@ def test_whatever_is_commanded_and_streamed_the_limits_hold(
     _check_limits(rig)
     assert rig.arm.state()["stale_executed"] == 0
     assert rig.arm.state()["faults"] == []
-    assert rig.arm._guard.violation(rig.plant.q) == ""
+    assert all(rig.arm._guard.violation(q) == "" for q in rig.commanded[::10])

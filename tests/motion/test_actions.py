@@ -1,0 +1,219 @@
+"""The arm's actions on a simulated arm: what they end with, and what the arm does meanwhile."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from services.action import Status
+from services.comm.cia402 import Fault
+from services.motion import actions
+
+FALL = math.sqrt(2 * 0.055 / 9.81)
+
+
+class Ball:
+    """A ball that leaves the edge `leaves` seconds from the start, as vision would predict it 50 times a second from `seen` on.
+
+    Predictions go on until `until` (s after the start, default: when the ball has fallen). The ball lies in the cup from
+    its arrival on if it is to be `caught`.
+    """
+
+    def __init__(
+        self,
+        leaves: float = 1.0,
+        y: float = 0.15,
+        seen: float = 0.2,
+        until: float = math.inf,
+        caught: bool = True,
+        sigma: float = 0.002,
+    ) -> None:
+        self.leaves, self.y, self.seen, self.until, self.caught, self.sigma = leaves, y, seen, until, caught, sigma
+        self.begun: float | None = None
+        self.speed = 1.4
+
+    def __call__(self, play: Any) -> None:
+        if self.begun is None:
+            self.begun = play.now
+        age = play.now - self.begun
+        if self.seen <= age < min(self.until, self.leaves + 0.15) and play.rig.cycle % 5 == 0:
+            play.rig.feed([self.leaves - age, 0.62, self.y, 0.62, -self.speed, 0.0, 0.0, self.sigma, 0.01])
+        if self.caught and age >= self.leaves + FALL:
+            play.rig.drives.ball(True)
+
+
+@pytest.mark.parametrize("action", [actions.intercept_tilted, actions.intercept_upright])
+def test_intercept_is_in_place_before_the_ball(play: Any, action: Callable[..., Any]) -> None:
+    result = play.play(action(play), Ball())
+    assert result.status is Status.SUCCESS
+    assert result.values["slack"] > 0.2
+    assert result.values["point"][1] == pytest.approx(0.15, abs=0.002)
+    assert play.device.state["mode"] == "follow", "following goes on"
+    assert play.device.state["in_place"]
+
+
+def test_intercept_waits_for_a_good_prediction(play: Any) -> None:
+    result = play.play(actions.intercept_tilted(play), Ball(sigma=0.03))
+    assert result.status is Status.SUCCESS
+    assert result.values["slack"] < 0.1
+
+
+def test_intercept_that_comes_late_is_a_failure_and_goes_on(play: Any) -> None:
+    result = play.play(actions.intercept_tilted(play), Ball(leaves=0.3, y=0.3, seen=0.25))
+    assert (result.status, result.cause) == (Status.FAILURE, "late")
+    assert play.device.state["mode"] == "follow"
+
+
+def test_intercept_without_a_ball_says_so(play: Any) -> None:
+    result = play.play(actions.intercept_tilted(play, patience=0.5), None)
+    assert (result.status, result.cause) == (Status.ERROR, "no_setpoint")
+    play.rig.run(0.1)
+    assert play.rig.arm.state()["mode"] == "hold"
+
+
+def test_intercept_when_vision_dies_says_so_and_the_arm_holds(play: Any) -> None:
+    begun = play.now
+    result = play.play(actions.intercept_tilted(play), Ball(leaves=1.5, y=0.3, until=0.3))
+    assert (result.status, result.cause) == (Status.ERROR, "no_setpoint")
+    assert play.now - begun < 0.3 + 0.06 + 0.05
+    play.rig.run(0.3)
+    assert play.rig.arm.stopped()
+    assert play.rig.arm.state()["stale_executed"] == 0
+
+
+def test_intercept_of_a_ball_out_of_reach(play: Any) -> None:
+    result = play.play(actions.intercept_tilted(play), Ball(y=1.4))
+    assert (result.status, result.cause) == (Status.ERROR, "unreachable")
+
+
+def test_intercept_with_a_faulty_drive(play: Any) -> None:
+    ball = Ball()
+
+    def world(play: Any) -> None:
+        ball(play)
+        if play.now - (ball.begun or 0.0) > 0.3:
+            play.rig.drives.trip(2, Fault.OVERHEATED)
+
+    result = play.play(actions.intercept_tilted(play), world)
+    assert (result.status, result.cause) == (Status.ERROR, "drive_fault")
+    assert result.values == {"joint": 2, "code": Fault.OVERHEATED}
+
+
+@pytest.mark.parametrize("action", [actions.intercept_tilted, actions.follow_and_wait])
+def test_a_cancelled_run_leaves_the_arm_holding(play: Any, action: Callable[..., Any]) -> None:
+    begun = play.now
+    assert play.play(action(play), Ball(), cancel=lambda: play.now - begun > 0.4) is None
+    play.rig.run(0.3)
+    assert play.rig.arm.state()["mode"] == "hold"
+    assert play.rig.arm.stopped()
+
+
+def test_the_two_actions_of_a_catch_hand_over(play: Any) -> None:
+    ball = Ball()
+    assert play.play(actions.intercept_tilted(play), ball).status is Status.SUCCESS
+    result = play.play(actions.follow_and_wait(play), ball)
+    assert result.status is Status.SUCCESS
+    assert play.rig.events == ["ball_caught"]
+    assert ball.begun is not None
+    assert play.now - ball.begun < 1.0 + FALL + 0.06 + 0.3 + 0.05
+    assert play.rig.arm.state()["stale_executed"] == 0
+    result = play.play(
+        actions.empty_and_home(play), lambda play: play.rig.drives.ball(play.rig.arm.state()["mode"] != "move")
+    )
+    assert result.status is Status.SUCCESS
+
+
+def test_a_ball_that_does_not_come_is_missed(play: Any) -> None:
+    ball = Ball(caught=False)
+    play.play(actions.intercept_tilted(play), ball)
+    result = play.play(actions.follow_and_wait(play, margin=0.4), ball)
+    assert (result.status, result.cause) == (Status.FAILURE, "missed")
+    assert ball.begun is not None
+    assert play.now - ball.begun == pytest.approx(1.0 + FALL + 0.4, abs=0.05)
+
+
+def test_waiting_while_vision_dies_is_an_error(play: Any) -> None:
+    ball = Ball(leaves=2.0, until=0.9)
+    assert play.play(actions.intercept_tilted(play), ball).status is Status.SUCCESS
+    result = play.play(actions.follow_and_wait(play), ball)
+    assert (result.status, result.cause) == (Status.ERROR, "no_setpoint")
+
+
+def test_waiting_for_nothing_is_an_error(play: Any) -> None:
+    result = play.play(actions.follow_and_wait(play, patience=0.3))
+    assert (result.status, result.cause) == (Status.ERROR, "no_setpoint")
+
+
+def test_the_cup_is_turned_over_until_it_is_empty(play: Any) -> None:
+    axes: list[float] = []
+
+    def world(play: Any) -> None:
+        up = play.rig.arm._guard.place(play.rig.plant.q).axis[2]
+        axes.append(up)
+        if up < -0.9:
+            play.rig.drives.ball(False)
+
+    play.rig.drives.ball(True)
+    play.rig.run(0.1)
+    play.device.state = play.rig.arm.state()
+    result = play.play(actions.empty_and_home(play), world)
+    assert result.status is Status.SUCCESS
+    assert min(axes) < -0.9
+    assert axes[-1] > 0.85
+
+
+def test_an_empty_cup_is_not_turned_over(play: Any) -> None:
+    begun = play.now
+    assert play.play(actions.empty_and_home(play)).status is Status.SUCCESS
+    assert play.now - begun < 0.1
+
+
+def test_a_ball_that_sticks_is_an_error(play: Any) -> None:
+    play.rig.drives.ball(True)
+    play.rig.run(0.1)
+    play.device.state = play.rig.arm.state()
+    result = play.play(actions.empty_and_home(play, attempts=2))
+    assert (result.status, result.cause) == (Status.ERROR, "cup_not_empty")
+    assert [body.get("pose") for body in play.device.sent] == ["empty", "home"] * 2
+
+
+def test_reset_and_home_recovers_from_a_fault(play: Any) -> None:
+    play.rig.arm.command(play.now, {"do": "move", "pose": "empty"})
+    play.rig.run(0.5)
+    play.rig.drives.trip(0, Fault.OVERCURRENT)
+    play.rig.run(0.5)
+    result = play.play(actions.reset_and_home(play))
+    assert result.status is Status.SUCCESS
+    assert play.rig.arm.state()["in_place"]
+    assert play.rig.arm.state()["faults"] == []
+
+
+def test_reset_and_home_says_why_it_cannot(play: Any) -> None:
+    play.rig.drives.power(False)
+    play.rig.run(0.3)
+    result = play.play(actions.reset_and_home(play, timeout=2.0))
+    assert result.status is Status.ERROR
+    assert result.cause in ("drive_fault", "power", "arm_timeout")
+
+
+def test_a_pose_behind_the_table_is_a_timeout_with_its_reason(make_rig: Any, make_play: Any) -> None:
+    rig = make_rig(start=[math.radians(angle) for angle in (18.7, 90.0, -90.0, 0.0, 0.0, 0.0)]).enable()
+    play = make_play(rig)
+    result = play.play(actions.reset_and_home(play, timeout=6.0, speed=1.0))
+    assert result.status is Status.ERROR
+    assert result.cause == "arm_timeout"
+    assert "table" in result.text
+    assert rig.arm.state()["faults"] == []
+
+
+def test_actions_that_find_the_drives_off_say_so(make_rig: Any, make_play: Any) -> None:
+    rig = make_rig(config={"enable": False})
+    rig.run(0.5)
+    play = make_play(rig)
+    for action in (actions.intercept_tilted(play), actions.empty_and_home(play)):
+        result = play.play(action)
+        assert (result.status, result.cause) == (Status.ERROR, "refused")
+        assert "not enabled" in result.text
