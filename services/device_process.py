@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import math
 import os
 import socket
 import time
@@ -27,8 +28,6 @@ HALT = "halt"
 """Verb of the node's own stop order, answered when the device stands still."""
 PRIORITY = 50
 """SCHED_FIFO priority, where the system permits it."""
-CATCH_UP = 5
-"""Periods that may be made up for after a stall; beyond that the grid starts anew."""
 
 
 def take_priority() -> bool:
@@ -73,6 +72,8 @@ class DeviceLoop:
             due = self._next(due, time.monotonic())
         with contextlib.suppress(OSError):
             self._driver.close()
+        if self._worker is not None:
+            self._worker.close()
 
     def _sleep_until(self, due: float) -> float:
         now = time.monotonic()
@@ -83,11 +84,10 @@ class DeviceLoop:
         return now
 
     def _next(self, due: float, now: float) -> float:
-        due += self._period
-        if now > due + CATCH_UP * self._period:
-            self._overruns += 1
-            return now
-        return due
+        """The next point of the grid. Missed cycles are left out: made up for in a burst, they would make a drive jump."""
+        missed = max(0, math.floor((now - due) / self._period))
+        self._overruns += missed
+        return due + (missed + 1) * self._period
 
     def _cycle(self, now: float) -> None:
         if not self._node.closed:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+import select
 import socket
+import threading
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,6 +18,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from services import memory as memory_module
 from services.action import Context, Result, Status, failure, success
+from services.device_process import LINKED, DeviceLoop
 from services.memory import Memory, event_name
 from services.outlets import Outlets
 from services.pipe import NewestLink, Pipe, link_pair
@@ -400,3 +404,116 @@ def test_a_rehearsal_has_a_limit() -> None:
     with pytest.raises(StillRunningError, match="has not ended after 2 s"):
         rehearse(act, limit=2.0)
     assert rehearse(act, cancel_after=1.0).result.cause == "cancelled"
+
+
+# --- the process of a cyclic driver ----------------------------------------------------------------------------------
+
+
+class Ports:
+    """Nothing around a driver."""
+
+    def poll(self) -> None: ...
+
+    def raised(self) -> list[tuple[str, dict[str, Any]]]:
+        return []
+
+
+class Moving(Stub):
+    """Moves from its first command until it is stopped; needs ten cycles to come to rest."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stopping = 0
+        self.closed_while_moving: bool | None = None
+
+    def step(self, now: float) -> None:
+        self.stopping = max(0, self.stopping - 1)
+        if self.stopping == 0 and "stop" in self.log:
+            self.moving = False
+
+    def stop(self, now: float) -> None:
+        self.log.append("stop")
+        self.stopping = self.stopping or 10
+
+    def close(self) -> None:
+        self.closed_while_moving = self.moving
+
+
+class Process:
+    """A device loop in a thread, with all ends of its sockets."""
+
+    def __init__(self, driver: Moving) -> None:
+        node, loop_end = socket.socketpair()
+        self.descriptors, far = socket.socketpair()
+        self.node, self._far, self._loop_end = Pipe(node), far, Pipe(loop_end)
+        loop = DeviceLoop(driver, Ports(), self._loop_end, far)  # type: ignore[arg-type]  # all that it uses
+        self.thread = threading.Thread(target=loop.run)
+        self.thread.start()
+
+    def link(self) -> NewestLink:
+        """A new worker."""
+        near, far = link_pair()
+        socket.send_fds(self.descriptors, [b"."], [far.fileno()])
+        far.close()
+        self.node.post([LINKED])
+        return NewestLink(near)
+
+    def told(self) -> list[Any]:
+        """The next that the loop says to its node."""
+        while True:
+            select.select([self.node], [], [], 10.0)
+            if items := self.node.read():
+                return items[0]
+
+    def end(self) -> None:
+        self.node.close()
+        self.thread.join(10.0)
+        self.descriptors.close()
+        self._far.close()
+        self._loop_end.close()
+        assert not self.thread.is_alive()
+
+
+def states(link: NewestLink, until: Callable[[list[Any]], bool]) -> list[Any]:
+    """Read states until one fits."""
+    while True:
+        select.select([link], [], [], 10.0)
+        state = link.newest()
+        assert not link.closed
+        if state is not None and until(state):
+            return state
+
+
+def test_the_driver_is_stopped_when_its_worker_dies() -> None:
+    driver = Moving()
+    process = Process(driver)
+    link = process.link()
+    link.send([1, "command", {"go": 1}])
+    assert states(link, lambda s: s[0] == 1)[2] is False, "it does not say that it moves"
+    link.close()
+    process.node.post(["command", "h", "halt"])
+    assert process.told()[:3] == ["told", "h", "stopped"]
+    second = process.link()
+    assert states(second, lambda s: True)[0] == 0, "the new worker's commands are counted from 1"
+    second.close()
+    process.end()
+
+
+def test_the_driver_is_stopped_before_the_process_leaves_a_dead_node() -> None:
+    driver = Moving()
+    process = Process(driver)
+    link = process.link()
+    link.send([1, "command", {"go": 1}])
+    states(link, lambda s: s[0] == 1)
+    process.end()
+    assert "stop" in driver.log and driver.closed_while_moving is False
+    link.close()
+
+
+@pytest.mark.parametrize(("verb", "answer"), [("hold", "held"), ("release", "released"), ("status", "up")])
+def test_the_node_commands_the_driver_itself(verb: str, answer: str) -> None:
+    process = Process(Moving())
+    process.node.post(["command", "c", verb])
+    told = process.told()
+    assert told[:3] == ["told", "c", answer] and told[3]["state"] == {"n": 0}
+    process.end()
