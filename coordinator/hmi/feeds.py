@@ -23,7 +23,7 @@ async def _live(request: web.Request) -> web.StreamResponse:
     house = request.app[HOUSE]
     if len(house.sessions) >= CLIENTS:
         raise web.HTTPServiceUnavailable(text=f"{CLIENTS} clients are connected already")
-    socket = web.WebSocketResponse(heartbeat=15.0, max_msg_size=LARGEST_MESSAGE, compress=False, timeout=2.0)
+    socket = web.WebSocketResponse(heartbeat=15.0, max_msg_size=LARGEST_MESSAGE, compress=False, timeout=0.5)
     if not socket.can_prepare(request).ok:
         raise web.HTTPUpgradeRequired(text="this address speaks WebSocket")
     await socket.prepare(request)

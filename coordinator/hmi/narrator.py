@@ -7,6 +7,7 @@ from typing import Any
 
 from coordinator.conditions.wording import Severity
 from coordinator.engine import (
+    Abort,
     CancelRun,
     Chosen,
     EventOccurred,
@@ -59,6 +60,7 @@ class Narrator:
         self._why: dict[str, str] = {}
         self._held: dict[str, str] = {}
         self._seen: State | None = None
+        self._aborted = False
         self._error_exits = {
             t.name for t in task.flat.transitions.values() if any(i.end is End.ERROR for i in t.inputs)
         }
@@ -110,6 +112,8 @@ class Narrator:
             if known is not None:
                 event = {**known, "count": known["count"] + 1, "last": round(time, 4)}
                 self.feed.emit("event", time=time, name=stimulus.event, event=event)
+        elif isinstance(stimulus, Abort):
+            self._aborted = True
         elif isinstance(stimulus, RunHeld):
             self._answered(time, stimulus)
 
@@ -231,8 +235,7 @@ class Narrator:
         self.feed.emit("paused", time=time, paused={"reason": paused.reason, "at": round(time, 4), "nodes": {}})
 
     def _finished(self, time: float, finished: Finished) -> None:
-        aborted = self.feed.state["mission"]["state"] == "stopping"
-        state = "aborted" if aborted else finished.status.value
+        state = "aborted" if self._aborted else finished.status.value
         self.feed.emit("paused", time=time, paused=None)
         self.feed.emit("mission", time=time, mission={"state": state, "reason": finished.reason})
 

@@ -53,6 +53,7 @@ class Page:
         """Close all connections and the port; commands that are being carried out are given up."""
         self._listening.close()
         self._house.closing = True
+        await asyncio.gather(*(session.leave() for session in self._house.sessions))
         await self._runner.cleanup()
         for task in list(self._house.commands):
             task.cancel()
@@ -80,7 +81,7 @@ async def start_page(
     number = listener.getsockname()[1]
     doors = Doors(token or secrets.token_urlsafe(24), number, names_for(host, names), tls is not None)
     house = House(port_object, TaskStore(tasks_folder), doors, offers, history)
-    runner = web.AppRunner(_application(house), access_log=None, keepalive_timeout=30.0, shutdown_timeout=2.0)
+    runner = web.AppRunner(_application(house), access_log=None, keepalive_timeout=30.0, shutdown_timeout=1.0)
     await runner.setup()
     assert runner.server is not None
     house.gate = Gate(runner.server)

@@ -82,6 +82,12 @@ class Session:
         except (ConnectionError, TimeoutError):
             await self._close_hard()
 
+    async def leave(self) -> None:
+        """Close the connection in good order, as when the server ends."""
+        with contextlib.suppress(Exception):
+            async with asyncio.timeout(1.0):
+                await self._socket.close(code=WSCloseCode.GOING_AWAY)
+
     def _receive(self, change: dict[str, Any]) -> None:
         self._pending.add(change)
         self._news.set()

@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 import pytest_asyncio
@@ -16,9 +18,6 @@ from coordinator.hmi.server import Page, start_page
 from coordinator.task import Executed, Status
 from coordinator.taskfile import load
 from tests.hmi.stage import Part, Stage
-
-if TYPE_CHECKING:
-    from playwright.async_api import Browser
 
 HERE = Path(__file__).parent
 BROWSER = Path(os.environ.get("PETROBOT_BROWSER", "/usr/bin/chromium"))
@@ -50,39 +49,46 @@ def tasks(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest_asyncio.fixture
-async def stage(tasks: Path, tmp_path: Path) -> AsyncIterator[Stage]:
+@asynccontextmanager
+async def staged(tasks: Path, runs: Path) -> AsyncIterator[Stage]:
     """A mission that stands ready to move parts; nothing has been started."""
-    made = Stage(tasks, SCRIPT, WHERE, tmp_path / "runs")
+    made = Stage(tasks, SCRIPT, WHERE, runs)
     path = tasks / "pick_and_place.toml"
     made.load(load(path))
     yield made
     await made.close()
 
 
-@pytest_asyncio.fixture
-async def page(stage: Stage, tasks: Path, tmp_path: Path) -> AsyncIterator[Page]:
-    """The page of that mission, served on loopback."""
-    history = JournalHistory(tmp_path / "runs")
+@asynccontextmanager
+async def served(stage: Stage, tasks: Path, runs: Path) -> AsyncIterator[Page]:
+    """The page of a mission, on loopback."""
+    history = JournalHistory(runs)
     made = await start_page(stage, tasks_folder=tasks, token="open sesame", offers=stage.offers, history=history)
     yield made
     await made.close()
 
 
 @pytest_asyncio.fixture
-async def browser() -> AsyncIterator[Browser]:
-    """Chromium without a window. Without one the test is skipped by name; where CI=true it fails."""
-    missing = None if BROWSER.exists() else f"no browser at {BROWSER}: install chromium or set PETROBOT_BROWSER"
-    try:
-        from playwright.async_api import async_playwright
-    except ImportError:
-        missing = "Playwright for Python is not installed"
-    if missing:
-        (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(missing)
-    async with async_playwright() as driver:
-        launched = await driver.chromium.launch(executable_path=str(BROWSER), args=ARGUMENTS)
-        yield launched
-        await launched.close()
+async def stage(tasks: Path, tmp_path: Path) -> AsyncIterator[Stage]:
+    """A mission for one test."""
+    async with staged(tasks, tmp_path / "runs") as made:
+        yield made
+
+
+@pytest_asyncio.fixture
+async def page(stage: Stage, tasks: Path, tmp_path: Path) -> AsyncIterator[Page]:
+    """Its page."""
+    async with served(stage, tasks, tmp_path / "runs") as made:
+        yield made
+
+
+def browser_missing() -> str:
+    """Why there is no browser to test with; empty if there is one."""
+    if not BROWSER.exists():
+        return f"no browser at {BROWSER}: install chromium or set PETROBOT_BROWSER"
+    if find_spec("playwright") is None:
+        return "Playwright for Python is not installed"
+    return ""
 
 
 @pytest.fixture

@@ -2,27 +2,63 @@
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
+import pytest_asyncio
 
-pytest.importorskip("playwright", reason="Playwright for Python is not installed")
+from coordinator.hmi.server import Page, start_page
+from coordinator.task import Executed, Status
+from tests.hmi.conftest import ARGUMENTS, BROWSER, browser_missing, served, staged
+from tests.hmi.stage import Part, Stage
 
-from playwright.async_api import Locator, expect
+if browser_missing() and os.environ.get("CI") != "true":
+    pytest.skip(browser_missing(), allow_module_level=True)
+
+from playwright.async_api import Browser, Locator, async_playwright, expect
 from playwright.async_api import Page as Tab
 
-from coordinator.hmi.server import Page
-from tests.hmi.stage import Stage
-
-if TYPE_CHECKING:
-    from playwright.async_api import Browser
-
+pytestmark = pytest.mark.asyncio(loop_scope="module")
 Watch = Callable[[Any], list[str]]
 SIZE = {"width": 1440, "height": 900}
+
+
+@pytest_asyncio.fixture(scope="module", loop_scope="module")
+async def browser() -> AsyncIterator[Browser]:
+    """Chromium without a window, one for all tests of this file."""
+    if browser_missing():
+        pytest.fail(browser_missing())
+    async with async_playwright() as driver:
+        launched = await driver.chromium.launch(executable_path=str(BROWSER), args=ARGUMENTS)
+        yield launched
+        await launched.close()
+
+
+@pytest_asyncio.fixture(loop_scope="module", autouse=True)
+async def _windows_are_closed(browser: Browser) -> AsyncIterator[None]:
+    """No window of one test goes on painting during the next."""
+    yield
+    for context in browser.contexts:
+        await context.close()
+
+
+@pytest_asyncio.fixture(loop_scope="module")
+async def stage(tasks: Path, tmp_path: Path) -> AsyncIterator[Stage]:
+    """A mission for one test."""
+    async with staged(tasks, tmp_path / "runs") as made:
+        yield made
+
+
+@pytest_asyncio.fixture(loop_scope="module")
+async def page(stage: Stage, tasks: Path, tmp_path: Path) -> AsyncIterator[Page]:
+    """Its page."""
+    async with served(stage, tasks, tmp_path / "runs") as made:
+        yield made
 
 
 async def opened(browser: Browser, page: Page, theme: str = "light") -> Tab:
@@ -169,3 +205,205 @@ async def run_it_by_hand(tab: Tab, stage: Stage, shots: Path) -> None:
     await why.get_by_role("button").click()
     await expect(tab.get_by_role("region", name="Selected")).to_contain_text("the part slipped out of the gripper")
     await tab.screenshot(path=shots / "why.png")
+
+
+# ---- live, with several operators -------------------------------------------------------------------------------------
+
+
+async def start_mission(tab: Tab, task: str = "") -> None:
+    """Take the controls and start."""
+    await tab.get_by_role("button", name="Take controls").click()
+    await tab.get_by_role("toolbar", name="Mission").get_by_role("button", name="Start").click()
+    await expect(tab.get_by_role("status", name="Mission state")).to_contain_text("Running")
+
+
+async def test_two_operators(browser: Browser, page: Page, stage: Stage) -> None:
+    """One holds the controls, the other watches the same, asks, and is handed them; the stop key is everybody's."""
+    ana, ben = await opened(browser, page), await opened(browser, page)
+    await start_mission(ana)
+    await expect(ben.get_by_role("status", name="Mission state")).to_contain_text("Running")
+    bens = ben.get_by_role("toolbar", name="Mission")
+    await expect(bens).to_contain_text("holds the controls")
+    await expect(bens.get_by_role("button", name="Pause")).to_be_disabled()
+    await ben.get_by_role("button", name="Ask for controls").click()
+    await ana.get_by_role("button", name="Hand over to").click()
+    await expect(bens).to_contain_text("You hold the controls")
+    await ben.reload()
+    await expect(bens).to_contain_text("You hold the controls")
+    await ana.get_by_role("searchbox", name="Find a place or transition").focus()
+    await ana.keyboard.press("F9")
+    for tab in (ana, ben):
+        await expect(tab.get_by_role("status", name="Mission state")).to_contain_text("Emergency stop")
+
+
+async def test_operators_hand_on_the_net(browser: Browser, page: Page, stage: Stage) -> None:
+    """Raise an event, stop at a breakpoint set beforehand, choose the alternative, force a way out, abort."""
+    stage.script["pick"].clear()
+    stage.script["pick"].append(Part(30.0))
+    tab = await opened(browser, page)
+    await tab.get_by_role("button", name="Take controls").click()
+    await element(tab, "^Transition picked", "Task net").click()
+    await tab.get_by_role("button", name="Set breakpoint").click()
+    await tab.get_by_label("Alternative for look").select_option("look__template")
+    await tab.get_by_role("toolbar", name="Mission").get_by_role("button", name="Start").click()
+    await element(tab, "^Transition begin", "Task net").click()
+    await expect(tab.get_by_role("region", name="Selected")).to_contain_text("waits for the event part there")
+    await tab.get_by_role("button", name="Raise part there").click()
+    running = tab.get_by_role("region", name="Running now")
+    await expect(running).to_contain_text("look template")
+    await expect(running).to_contain_text("for look: operator")
+    await expect(running).to_contain_text("pick")
+    await element(tab, "^Action place pick", "Task net").click()
+    await tab.get_by_role("button", name="Force picked").click()
+    await expect(running).to_contain_text("put")
+    await tab.get_by_role("button", name="Abort").click()
+    await tab.get_by_role("button", name="Abort the mission?").click()
+    await expect(tab.get_by_role("status", name="Mission state")).to_contain_text("Aborted")
+    verbs = [verb for _, verb, _ in stage.commands]
+    assert verbs == [
+        "take_controls", "breakpoint", "override_selector", "start", "raise_event", "force_exit", "abort",
+    ]  # fmt: skip
+
+
+async def test_a_folded_error_branch_turns_red(browser: Browser, page: Page, stage: Stage, shots: Path) -> None:
+    """Error branches are hidden behind a badge until a token enters one; a press shows them."""
+    stage.script["clear"].clear()
+    stage.script["clear"].append(Part(30.0))
+    tab = await opened(browser, page, "dark")
+    await expect(element(tab, "^Action place clear", "Task net")).to_be_hidden()
+    await start_mission(tab)
+    stage.happen("part_there")
+    badge = tab.locator(".net [data-name=pick] .mark.fold")
+    await expect(badge).to_have_class(re.compile("alarm"))
+    await tab.screenshot(path=shots / "dark.png")
+    await badge.click()
+    await expect(element(tab, "^Action place clear, 1 token", "Task net")).to_be_visible()
+    await tab.get_by_role("button", name="Error branches").click()
+    await expect(element(tab, "^Action place clear", "Task net")).to_be_hidden()
+
+
+EVIL = "<img src=x onerror=\"document.title='owned'\"><script>document.title='owned'</script>"
+
+
+async def test_script_in_names_and_reasons_is_text(browser: Browser, page: Page, stage: Stage, faults: Watch) -> None:
+    """Whatever a node, a task file or another operator calls things, the page shows it as text."""
+    text = (stage.tasks / "pick_and_place.toml").read_text()
+    quoted = EVIL.replace('"', '\\"')
+    (stage.tasks / "evil.toml").write_text(
+        text.replace("x = 560\ny = 180", f'label = "{quoted}"\nx = 560\ny = 180').replace("The part lies", quoted)
+    )
+    stage.script["pick"] = type(stage.script["pick"])([Part(0.2, Status.ERROR, "evil", EVIL, Executed.NO), Part(0.2)])
+    stage.where["pick"] = EVIL
+    tab = await opened(browser, page)
+    complaints = faults(tab)
+    await tab.get_by_role("button", name="Take controls").click()
+    for operator in ("ana", EVIL):
+        await stage.command(operator, "ask_controls", {})
+    holder = stage.controls.holder
+    assert holder is not None
+    assert (await stage.command(holder, "start", {"task": "evil"}))["ok"]
+    stage.happen("part_there")
+    stage.feed.emit("variable", name=EVIL, value=EVIL)
+    stage.feed.emit("notice", notice={"level": "error", "text": EVIL})
+    await expect(tab.get_by_role("region", name="Last firings")).to_contain_text("<img src=x onerror=")
+    await tab.get_by_role("tab", name="Variables").click()
+    await expect(tab.get_by_role("tabpanel", name="Variables")).to_contain_text("<script>")
+    await tab.get_by_role("tab", name="Design").click()
+    await tab.get_by_label("Task", exact=True).select_option("evil")
+    await expect(tab.get_by_label("Name", exact=True)).to_be_visible()
+    assert await tab.title() == "petrobot"
+    assert await tab.locator("img[src=x]").count() == 0
+    assert await tab.locator("body script").count() == 0
+    assert complaints == []
+
+
+async def test_a_lost_connection_is_plain_to_see(browser: Browser, stage: Stage, tasks: Path, tmp_path: Path) -> None:
+    """When the coordinator goes away the page says so at once, and it catches up by itself when it is back."""
+    async with served(stage, tasks, tmp_path / "runs") as first:
+        tab = await opened(browser, first)
+        port = int(first.url.rpartition(":")[2].partition("/")[0])
+        await expect(tab.get_by_role("button", name="Take controls")).to_be_visible()
+    await expect(tab.get_by_role("alert")).to_contain_text("Connection to the coordinator lost")
+    stage.feed.emit("marking", marking={"parts": 7})
+    again = await start_page(stage, tasks_folder=tasks, port=port, token="open sesame")
+    try:
+        await expect(tab.get_by_role("alert")).to_be_hidden(timeout=10_000)
+        await expect(element(tab, "^Control place parts, 7 tokens", "Task net")).to_be_visible()
+    finally:
+        await again.close()
+
+
+async def test_details(browser: Browser, page: Page, stage: Stage, shots: Path, faults: Watch) -> None:
+    """Camera with detections, devices, set-point latency, learning curves, events, variables; on a wall screen too."""
+    tab = await opened(browser, page, "dark")
+    complaints = faults(tab)
+    await start_mission(tab)
+    pixel = "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNkYPhfDwAChwGA60e6kgAAAABJRU5ErkJggg=="
+    seen = [
+        {"kind": "circle", "x": 300, "y": 200, "r": 20, "label": "part"},
+        {"kind": "path", "points": [[0, 0], [9, 9]]},
+    ]
+    image = {"mime": "image/png", "data": pixel, "width": 640, "height": 360, "age": 0.02, "detections": seen}
+    stage.feed.emit("image", name="table", image=image)
+    stage.feed.emit(
+        "device", name="arm", device={"state": "enabled", "joints": [0.1, -1.2, 0.5], "values": {"load": 0.3}}
+    )
+    stage.feed.emit("setpoint", stream="point", samples=[[i / 10, 0.01 + i / 1e4] for i in range(60)])
+    curve = {"kind": "curve", "title": "Choice", "x": "runs", "y": "p", "series": ["a", "b"]}
+    stage.feed.emit("report", name="c", report={**curve, "columns": [[1, 2, 3], [0.5, 0.6, 0.7], [0.5, 0.4, 0.3]]})
+    await tab.get_by_role("tab", name="Camera").click()
+    await expect(tab.get_by_role("img", name="Image of table")).to_be_visible()
+    await expect(tab.get_by_role("tabpanel", name="Camera")).to_contain_text("20 ms old")
+    await tab.get_by_role("tab", name="Devices").click()
+    await expect(tab.get_by_role("tabpanel", name="Devices")).to_contain_text("enabled")
+    await tab.get_by_role("tab", name="Set points").click()
+    await expect(tab.get_by_role("figure", name="Age of the newest set point").locator("canvas")).to_be_visible()
+    await tab.get_by_role("tab", name="Learning").click()
+    await expect(tab.get_by_role("figure", name="Choice").locator("canvas")).to_be_visible()
+    await tab.get_by_role("tab", name="Events").click()
+    await expect(tab.get_by_role("tabpanel", name="Events")).to_contain_text("part there")
+    await tab.get_by_role("tab", name="Timeline").click()
+    await tab.get_by_role("button", name="Wall screen").click()
+    await tab.screenshot(path=shots / "wall.png")
+    await tab.get_by_role("button", name="Light colours").click()
+    assert await tab.evaluate("document.documentElement.dataset.theme") == "light"
+    assert complaints == []
+
+
+async def test_history(browser: Browser, page: Page, stage: Stage, shots: Path, faults: Watch) -> None:
+    """Scrub a finished run forwards and backwards, jump to its error, compare it with another, start one from a point."""
+    tab = await opened(browser, page)
+    complaints = faults(tab)
+    stage.on_beat.append(
+        lambda _: None if stage.feed.state["events"]["part_there"]["armed"] else stage.happen("part_there")
+    )
+    await tab.get_by_role("button", name="Take controls").click()
+    for _ in range(2):
+        await tab.get_by_role("toolbar", name="Mission").get_by_role("button", name="Start").click()
+        await expect(tab.get_by_role("status", name="Mission state")).to_contain_text("Running")
+        await expect(tab.get_by_role("status", name="Mission state")).to_contain_text("Success", timeout=15_000)
+    await tab.get_by_role("tab", name="History").click()
+    runs = tab.get_by_role("navigation", name="Runs")
+    await runs.get_by_role("button", name="pick_and_place-2", exact=False).first.click()
+    await expect(runs.get_by_role("button", name="Compare with pick_and_place-2")).to_be_disabled()
+    scrub = tab.get_by_role("toolbar", name="Scrub")
+    await scrub.get_by_role("button", name="First record").click()
+    net = "Net at this record"
+    await expect(element(tab, "^Control place parts, 2 tokens", net)).to_be_visible()
+    await scrub.get_by_role("button", name="Next error").click()
+    current = tab.get_by_role("complementary", name="Records").locator("[aria-current=true]")
+    await expect(current).to_contain_text("slipped")
+    await scrub.get_by_role("button", name="Previous record").click()
+    await expect(current).not_to_contain_text("slipped")
+    await scrub.get_by_role("button", name="Last record").click()
+    await expect(element(tab, "^Control place parts, 0 tokens", net)).to_be_visible()
+    await runs.get_by_role("button", name="Compare with pick_and_place-3").click()
+    await expect(tab.get_by_role("status").filter(has_text="differ from firing 3")).to_contain_text("pick failed here")
+    await scrub.get_by_role("button", name="Previous error").click()
+    await tab.screenshot(path=shots / "history.png")
+    await scrub.get_by_role("button", name="Simulate from here").click()
+    await expect(tab.get_by_role("tab", name="Live")).to_have_attribute("aria-selected", "true")
+    _, verb, data = stage.commands[-1]
+    assert (verb, data["mode"], data["from"]["run"]) == ("start", "simulated", "pick_and_place-2")
+    assert data["marking"]["clear"] == 1
+    assert complaints == []

@@ -17,7 +17,7 @@ OWN = sorted(p for p in PAGE.rglob("*") if p.suffix in (".js", ".css", ".html") 
 
 def test_each_file_is_the_one_that_was_taken() -> None:
     """Hashes of all vendored files, none missing, none more; each library names its version and licence."""
-    listed = {}
+    listed: dict[str, str] = {}
     for name, library in LIST.items():
         assert library["version"] and library["licence"] and library["package"]
         listed |= {f"{name}/{file}": digest for file, digest in library["sha256"].items()}

@@ -122,8 +122,10 @@ export class History {
   }
 
   async shown() {
+    const before = this.opening;
     this.runs = await listRuns();
     this.paintRuns();
+    if (this.opening !== before) return;
     if (!this.reel) await this.open(this.runs[0]?.id ?? SESSION);
     else if (this.reel.run.id === SESSION) this.open(SESSION, true);
     else for (const screen of this.screens) if (screen.reel) screen.canvas.view.fit();
@@ -188,8 +190,9 @@ export class History {
   }
 
   async open(id, keep = false) {
+    const ticket = (this.opening = (this.opening ?? 0) + 1);
     const reel = await this.fetchReel(id);
-    if (!reel) return;
+    if (!reel || ticket !== this.opening) return; // another run was chosen meanwhile
     this.reel = reel;
     this.screens[0].load(reel);
     this.range.max = String(reel.records.length);
