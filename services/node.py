@@ -170,7 +170,9 @@ class Node:
     def _start(self, now: float, call: Call) -> None:
         action = self.directory.actions.get(call.service)
         key = LOOP if action is None else action.device or GENERAL
-        deadline = call.deadline if call.deadline is not None else action and action.deadline
+        deadline = call.deadline
+        if deadline is None and action is not None:
+            deadline = action.deadline
         self._at[call.id] = key
         self.places[key].take(now, Begin(call.id, call.service, call.arguments, deadline, call.seed))
 

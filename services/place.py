@@ -66,12 +66,17 @@ class InlinePlace:
         self._runner = Runner(
             actions,
             clock=clock,
-            device=remote or (self._remote if self._cyclic else driver and DirectDevice(driver)),
+            device=remote or self._control(),
             streams=streams,
             substitutes=substitutes,
             virtual=virtual,
             fenced=remote is not None,
         )
+
+    def _control(self) -> DeviceControl | None:
+        if self._driver is None:
+            return None
+        return self._remote if self._cyclic is not None else DirectDevice(self._driver)
 
     def _post(self, command: DeviceCommand) -> None:
         self._commands.append(command)
