@@ -1,0 +1,143 @@
+"""The command line as a user meets it: help with an example everywhere, exit codes, one clear line for each fault."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from coordinator.cli import COMMANDS, main
+
+ROOT = Path(__file__).parents[2]
+
+
+def petrobot(*arguments: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
+    """Run the command in a process of its own."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "200"}
+    command = [sys.executable, "-m", "coordinator", *arguments]
+    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("name", [command.name for command in COMMANDS])
+def test_every_command_helps_with_an_example(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """--help says what it does, shows an example and the exit codes."""
+    assert main([name, "--help"]) == 0
+    shown = capsys.readouterr().out
+    assert f"petrobot {name}" in shown.partition("example:")[2]
+    assert "exit codes" in shown
+
+
+def test_overview_and_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
+    """Without a command all are listed; a wrong one is bad input."""
+    assert main([]) == 0
+    shown = capsys.readouterr().out
+    assert all(f"  {command.name} " in shown for command in COMMANDS)
+    assert main(["fly"]) == 2
+    assert "no command 'fly'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["run", "no_such_task"], "no task 'no_such_task'"),
+        (["run", "catch_ball", "--set", "speed=3"], "no parameter 'speed'"),
+        (["run", "catch_ball", "--use", "track_ball=teleport"], "choose among"),
+        (["run", "catch_ball", "--mode", "lockstep", "--regime", "Z9", "--quiet"], "Z9"),
+        (["run", "catch_ball", "--services", "nowhere.toml"], "nowhere.toml"),
+        (["check", "services.toml"], "services.toml"),
+        (["replay", "no_such_run"], "no run 'no_such_run'"),
+        (["new", "action", "2fast"], "2fast"),
+        (["calibrate", "--views", "nowhere"], "nowhere"),
+    ],
+)
+def test_bad_input_is_exit_code_2_and_names_the_fault(
+    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One clear line that names what was wrong."""
+    monkeypatch.chdir(ROOT)
+    assert main(arguments) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_nodes_that_are_not_there_are_exit_code_3(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`run` and `nodes` say which node does not answer."""
+    services = tmp_path / "services.toml"
+    text = (
+        (ROOT / "services.toml")
+        .read_text(encoding="utf-8")
+        .replace("services/cell.toml", str(ROOT / "services/cell.toml"))
+    )
+    for port in ("7300", "7301", "7302"):
+        text = text.replace(f"port = {port}", f"port = {int(port) - 6300}")  # nothing listens on ports this low
+    services.write_text(text, encoding="utf-8")
+    assert main(["nodes", "--services", str(services), "--timeout", "0.3"]) == 3
+    assert "away" in capsys.readouterr().out
+
+
+def test_check_gives_its_findings_as_json(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The shipped task may run on the shipped nodes."""
+    monkeypatch.chdir(ROOT)
+    assert main(["check", "catch_ball", "--json", "-"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["ok"] is True
+    assert answer["task"] == "catch_ball"
+
+
+def test_a_task_without_error_branch_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`check` and `run` both refuse it, naming place and remedy."""
+    from coordinator.cli.new import TASK
+
+    path = tmp_path / "broken.toml"
+    broken = TASK.replace("{name}", "broken").replace(
+        '[transitions.failed]\nin = ["work:error"]\nout = ["recover"]\n', ""
+    )
+    path.write_text(broken, encoding="utf-8")
+    assert main(["check", str(path)]) == 2
+    said = capsys.readouterr()
+    assert "work" in said.out + said.err
+    assert "error" in said.out + said.err
+
+
+def test_show_draws_svg(capsys: pytest.CaptureFixture[str]) -> None:
+    """Error branches only when asked for."""
+    assert main(["show", "catch_ball"]) == 0
+    plain = capsys.readouterr().out
+    assert main(["show", "catch_ball", "--errors"]) == 0
+    whole = capsys.readouterr().out
+    assert plain.startswith(("<svg", "<?xml"))
+    assert len(whole) > len(plain)
+    assert "recover_arm" in whole
+
+
+@pytest.mark.processes
+def test_new_writes_what_works(tmp_path: Path) -> None:
+    """The skeletons' own tests pass as they are written."""
+    for what, name in (("action", "wave"), ("task", "greet")):
+        assert petrobot("new", what, name, cwd=tmp_path).returncode == 0
+    environment = {**os.environ, "PYTHONPATH": f"{tmp_path}:{ROOT}"}
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", os.devnull, str(tmp_path)]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+    assert "4 passed" in done.stdout
+    assert petrobot("new", "task", "greet", cwd=tmp_path).returncode == 2
+
+
+@pytest.mark.processes
+def test_lockstep_run_writes_the_promised_file(tmp_path: Path) -> None:
+    """The keys that scripts rely on; the same seed gives the same file but for wall_s."""
+    results = []
+    for number in range(2):
+        path = tmp_path / f"{number}.json"
+        arguments = ("catch_ball", "--mode", "lockstep", "--runs", "2", "--seed", "1", "--json", str(path))
+        done = petrobot("run", *arguments, "--quiet")
+        assert done.returncode == 0, done.stderr
+        results.append(json.loads(path.read_text(encoding="utf-8")))
+    for key in ("task", "mode", "seed", "regime", "runs", "caught", "throws", "wall_s", "sim_s", "firings"):
+        assert key in results[0]
+    assert all({"n", "speed", "caught", "miss_mm", "status"} <= set(throw) for throw in results[0]["throws"])
+    assert len(results[0]["throws"]) == 2
+    assert {**results[0], "wall_s": 0} == {**results[1], "wall_s": 0}
