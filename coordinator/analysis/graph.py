@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +34,7 @@ class Graph:
         return np.searchsorted(self.source, np.arange(self.n + 1)).astype(np.int64)
 
     @cached_property
-    def _into(self) -> tuple[Index, Index]:
+    def into(self) -> tuple[Index, Index]:
         """Edges by target: (first of each vertex, edge numbers)."""
         order = np.argsort(self.target, kind="stable")
         return np.searchsorted(self.target[order], np.arange(self.n + 1)).astype(np.int64), order
@@ -44,7 +45,7 @@ class Graph:
 
     def backward(self, seeds: Mask | Sequence[int], edges: Mask | None = None) -> Mask:
         """Vertices from which a seed can be reached (seeds included) along the given edges (all by default)."""
-        return self._spread(seeds, edges, *self._into, self.source)
+        return self._spread(seeds, edges, *self.into, self.source)
 
     def _spread(
         self, seeds: Mask | Sequence[int], edges: Mask | None, row: Index, order: Index | None, far: NDArray[np.int32]
@@ -53,7 +54,7 @@ class Graph:
         reached[seeds] = True
         front = np.flatnonzero(reached)
         while len(front):
-            at = _ranges(row[front], row[front + 1])
+            at = ranges(row[front], row[front + 1])
             at = at if order is None else order[at]
             if edges is not None:
                 at = at[edges[at]]
@@ -68,7 +69,7 @@ class Graph:
         came[start] = -1
         front = np.array([start])
         while len(front) and not goals[front].any():
-            at = _ranges(self.row[front], self.row[front + 1])
+            at = ranges(self.row[front], self.row[front + 1])
             at = at if edges is None else at[edges[at]]
             at = at[came[self.target[at]] == -2]
             came[self.target[at[::-1]]] = at[::-1]
@@ -135,7 +136,12 @@ class Graph:
             winning &= reaching
 
 
-def _ranges(first: Index, last: Index) -> Index:
+def sum_by(index: NDArray[Any], values: NDArray[np.float64], n: int) -> NDArray[np.float64]:
+    """Sum of the values that share an index, shape (n,)."""
+    return np.asarray(np.bincount(index, weights=values, minlength=n), dtype=np.float64)
+
+
+def ranges(first: Index, last: Index) -> Index:
     """All numbers of the half-open ranges one after the other."""
     length = last - first
     total = int(length.sum())

@@ -51,3 +51,24 @@ def philosophers(n: int) -> Net:
         arcs[f"then_left{i}"] = ({f"hasright{i}": 1, left: 1}, {f"eat{i}": 1})
         arcs[f"done{i}"] = ({f"eat{i}": 1}, {f"think{i}": 1, left: 1, right: 1})
     return Net.build(places, arcs)
+
+
+def queue(capacity: int) -> Net:
+    """A queue with room for `capacity` customers; arrivals are blocked when it is full (M/M/c/K by its rates)."""
+    return Net.build(
+        {"free": capacity, "waiting": 0},
+        {"arrive": ({"free": 1}, {"waiting": 1}), "serve": ({"waiting": 1}, {"free": 1})},
+    )
+
+
+def repairman(machines: int) -> Net:
+    """Machines that fail and are repaired by one person (or several, by the servers of `repair`)."""
+    return Net.build(
+        {"up": machines, "down": 0}, {"fail": ({"up": 1}, {"down": 1}), "repair": ({"down": 1}, {"up": 1})}
+    )
+
+
+def stages(k: int) -> Net:
+    """k phases one after the other: an Erlang law with rates all equal."""
+    places = {f"s{i}": int(i == 0) for i in range(k + 1)}
+    return Net.build(places, {f"t{i}": ({f"s{i}": 1}, {f"s{i + 1}": 1}) for i in range(k)})

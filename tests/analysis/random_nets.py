@@ -6,6 +6,7 @@ from collections import deque
 
 from hypothesis import strategies as st
 
+from coordinator.analysis.gspn import Gspn
 from coordinator.net import Marking, Net
 
 Weights = dict[str, int]
@@ -66,3 +67,28 @@ def brute_force(net: Net, limit: int) -> tuple[list[Marking], list[tuple[int, in
                 order.append(after)
             edges.append((i, t, number[after]))
     return order, edges
+
+
+@st.composite
+def gspns(draw: st.DrawFn, *, tokens: int = 2) -> Gspn:
+    """A bounded GSPN whose transitions move one token each (some immediate, some with several or unlimited servers).
+
+    An immediate transition only moves tokens to places of higher number, so time always passes.
+    """
+    places = draw(st.integers(3, 5))
+    names = [f"p{i}" for i in range(places)]
+    arcs: dict[str, tuple[Weights, Weights]] = {}
+    rates: dict[str, float] = {}
+    weights: dict[str, float] = {}
+    servers: dict[str, int | None] = {}
+    for i in range(draw(st.integers(2, 8))):
+        a, b = draw(st.tuples(st.integers(0, places - 1), st.integers(0, places - 1)).filter(lambda ab: ab[0] != ab[1]))
+        amount = draw(st.floats(0.25, 4.0))
+        name = f"t{i}"
+        if draw(st.booleans()) and a < b:
+            weights[name] = amount
+        else:
+            rates[name], servers[name] = amount, draw(st.sampled_from([1, 2, None]))
+        arcs[name] = ({names[a]: 1}, {names[b]: 1})
+    initial = dict.fromkeys(names, 0) | {names[0]: draw(st.integers(1, tokens))}
+    return Gspn.of(Net.build(initial, arcs), rates, weights=weights, servers=servers)
