@@ -9,13 +9,15 @@ Used alike in real time (`client.py` drives it) and in lock step (its messages t
 
 | cause | executed | when |
 |---|---|---|
-| unreachable | no | the peer is away and was not sent the call |
-| refused | no / unknown | the peer refuses the connection |
+| unreachable | no * | the peer is away and was not sent the call |
+| refused | no * | the peer refuses the connection; unknown for what it was sent before |
 | lost | unknown | the link broke and did not come back in time |
 | rebooted | unknown | the peer came back as another boot |
 | not_accepted | unknown | neither ACCEPT nor RESULT in time; cancelled |
 | no_answer | unknown | deadline or cancel long over and no RESULT; cancelled |
 | cancelled | no | cancelled before it left |
+
+* unknown if the owner names the boot that the call was meant for: then it may have been sent before a restart of the owner.
 """
 
 from __future__ import annotations
@@ -152,16 +154,16 @@ class Caller:
         if self.up:
             self._send(now, pending)
         elif self._refusal:
-            self._end(id, "refused", self._refusal, Executed.NO)
+            self._end(id, "refused", self._refusal, pending.if_unsent)
         elif self._held_until is None or now >= self._held_until:
-            self._end(id, "unreachable", f"{self.peer} is not there", Executed.NO)
+            self._end(id, "unreachable", f"{self.peer} is not there", pending.if_unsent)
 
     def cancel(self, now: float, id: str, reason: str = "") -> None:  # noqa: A002
         """Ask for a call's run to be stopped; it still ends with one `Ended`. An id that is not under way is left alone."""
         pending = self._pending.get(id)
         if pending is None or pending.cancel is not None:
             return
-        if not pending.sent:
+        if not pending.sent and pending.any_boot:
             self._end(id, "cancelled", reason, Executed.NO)
             return
         pending.cancel = reason
@@ -190,9 +192,15 @@ class Caller:
             self._messages.append(Subscribe(self._names))
 
     def acknowledge(self, now: float, id: str) -> None:  # noqa: A002
-        """The result of this call is safe; the peer may forget it."""
-        if self._settled.is_safe(id) is False:
+        """The result of this call is safe; the peer may forget it. After a restart also of a call of the time before."""
+        if id not in self._pending and not self._settled.is_safe(id):
             self._ack(now, id)
+
+    def disown(self, now: float, id: str) -> None:  # noqa: A002
+        """A run that the peer still keeps (`PeerBack.runs`) is of no use: stop it; its result comes as `Late`."""
+        if id not in self._pending and self.up:
+            self._settled.give_up(id)
+            self._messages.append(Cancel(id, "disowned"))
 
     def acknowledge_event(self, now: float, event: Event) -> None:
         """This event of its source and all before it are safe."""
@@ -279,7 +287,8 @@ class Caller:
         safe = self._settled.is_safe(id_)
         if safe is None:
             self._settled.turn_up(id_)
-            self._notices.append(Late(outcome))
+            if outcome.executed is not Executed.UNKNOWN:
+                self._notices.append(Late(outcome))
         if safe is not False:
             self._ack(now, id_)
 
@@ -383,7 +392,7 @@ class Caller:
             if pending.sent:
                 self._end(id_, cause, text, Executed.UNKNOWN)
             else:
-                self._end(id_, "unreachable" if cause == "lost" else cause, text, Executed.NO)
+                self._end(id_, "unreachable" if cause == "lost" else cause, text, pending.if_unsent)
 
     def _end(self, id_: str, cause: str, text: str, executed: Executed) -> None:
         pending = self._pending.pop(id_)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
-from services.comm.messages import Call
+from services.comm.messages import Call, Executed
 
 NEVER: Final = float("inf")
 
@@ -35,13 +35,18 @@ class Pending:
 
     call: Call
     any_boot: bool
-    """Until it is sent, it may go to whatever boot the peer is."""
+    """Until it is sent, it may go to whatever boot the peer is; False when its owner names one."""
     made: float
     sent: bool = False
     accepted: bool = False
     cancel: str | None = None
     accept_due: float = NEVER
     result_due: float = NEVER
+
+    @property
+    def if_unsent(self) -> Executed:
+        """What is known when it ends unsent: an owner that names a boot may have sent it before he was restarted."""
+        return Executed.NO if self.any_boot else Executed.UNKNOWN
 
 
 class UnderWay(dict[str, Pending]):

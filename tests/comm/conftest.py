@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, get_args
 
 import pytest
@@ -42,9 +42,11 @@ _FIELDS: dict[str, st.SearchStrategy[Any]] = {
 }
 
 
-def _messages_of(cls: type[Any]) -> st.SearchStrategy[Any]:
-    fields = {field.name: _FIELDS[str(field.type)] for field in dataclasses.fields(cls)}
-    return st.builds(cls, **fields)
+def messages_of(kinds: Iterable[type[Any]]) -> st.SearchStrategy[Any]:
+    """Any message of these kinds."""
+    return st.one_of(
+        [st.builds(cls, **{field.name: _FIELDS[str(field.type)] for field in dataclasses.fields(cls)}) for cls in kinds]
+    )
 
 
 KINDS: list[type[Any]] = list(get_args(Message))
@@ -53,7 +55,7 @@ KINDS: list[type[Any]] = list(get_args(Message))
 @pytest.fixture(scope="session")
 def messages() -> st.SearchStrategy[Any]:
     """Any message of any kind (ticks without envelopes), small enough for its kind's limit."""
-    return st.one_of([_messages_of(cls) for cls in KINDS if LIMITS[cls.KIND] >= 2048 or cls is Tick])
+    return messages_of(cls for cls in KINDS if LIMITS[cls.KIND] >= 2048 or cls is Tick)
 
 
 @pytest.fixture(scope="session")

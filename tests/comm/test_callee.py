@@ -1,0 +1,335 @@
+"""The called end by itself: whom it welcomes, what it refuses, what it remembers, when it stops a run."""
+
+from __future__ import annotations
+
+import pytest
+
+from services.comm import messages as m
+from services.comm.callee import Callee, CancelRun, Commanded, Keeping, Offer, StartRun
+from services.comm.messages import Executed
+
+COORD = m.Hello(1, 1, "coordinator", "coord", "c1", 3, "d1")
+
+
+def _failing(now: float, call: m.Call) -> m.Outcome:
+    raise RuntimeError("no luck")
+
+
+OFFERS = {
+    "move": Offer(device="arm", orphan_time=1.0),
+    "track": Offer(),
+    "limited": Offer(deadline=2.0),
+    "tune": Offer(scope="local"),
+    "get": Offer(inline=lambda now, call: m.Outcome(call.id, "success", {"at": now})),
+    "broken": Offer(inline=_failing),
+}
+
+
+def _callee(*hellos: m.Hello, local: bool = True, keeping: Keeping | None = None) -> Callee:
+    callee = Callee("motion", "n1", OFFERS, directory="d1", keeping=keeping)
+    for hello in hellos or (COORD,):
+        assert isinstance(callee.link_up(0.0, hello.name, hello, local=local), m.Welcome)
+    return callee
+
+
+def _said(callee: Callee) -> list[m.Message]:
+    return [message for _, message in callee.messages()]
+
+
+def _outcome(callee: Callee) -> tuple[str, str, Executed]:
+    [message] = [message for message in _said(callee) if isinstance(message, m.Outcome)]
+    return message.status, message.cause, message.executed
+
+
+def test_a_run_from_call_to_acknowledged_result() -> None:
+    callee = _callee()
+    call = m.Call("1", "move", {"to": 1}, 5.0, 3, "n1")
+    callee.receive(0.0, "coord", call)
+    assert callee.orders() == [StartRun(call, "coord")] and callee.orders() == []
+    callee.feedback(0.1, "1", 1.5, {"n": (1,)})
+    outcome = callee.finish(0.5, "1", "success", {"p": (1, 2)}, cpu_seconds=0.1)
+    assert outcome == m.Outcome("1", "success", {"p": [1, 2]}, "", "", Executed.YES, 0.5, 0.1)
+    assert _said(callee) == [m.Accept("1"), m.Feedback("1", 1.0, {"n": [1]}), outcome]
+    callee.receive(1.0, "coord", call)
+    assert _said(callee) == [outcome] and callee.orders() == [], "a known id is answered, not run"
+    callee.receive(1.1, "coord", m.ResultAck("1"))
+    callee.receive(1.2, "coord", call)
+    assert _outcome(callee) == ("error", "forgotten", Executed.UNKNOWN) and callee.orders() == []
+
+
+def test_a_known_id_that_still_runs_is_accepted_again() -> None:
+    callee = _callee()
+    for _ in range(2):
+        callee.receive(0.0, "coord", m.Call("1", "move", epoch=3))
+    assert _said(callee) == [m.Accept("1"), m.Accept("1")]
+    assert len(callee.orders()) == 1 and callee.running() == {"1": "move"}
+
+
+@pytest.mark.parametrize(
+    ("call", "local", "cause", "executed"),
+    [
+        (m.Call("1", "nowhere"), True, "unknown_service", Executed.NO),
+        (m.Call("1", "tune"), False, "local_only", Executed.NO),
+        (m.Call("1", "move", epoch=2), True, "old_epoch", Executed.NO),
+        (m.Call("1", "move", boot="n0", epoch=3), True, "rebooted", Executed.UNKNOWN),
+        (m.Call("1", "broken", epoch=3), True, "crashed", Executed.UNKNOWN),
+    ],
+)
+def test_refusals(call: m.Call, local: bool, cause: str, executed: Executed) -> None:
+    callee = _callee(local=local)
+    call = m.Call(call.id, call.service, call.arguments, call.deadline, call.epoch or 3, call.boot)
+    callee.receive(0.0, "coord", call)
+    assert _outcome(callee) == ("error", cause, executed)
+    assert callee.orders() == []
+
+
+def test_a_local_service_is_not_even_shown_to_another_host() -> None:
+    callee = Callee("motion", "n1", OFFERS)
+    welcome = callee.link_up(0.0, "coord", COORD, local=False)
+    assert isinstance(welcome, m.Welcome) and "tune" not in welcome.offers
+    callee = _callee()
+    callee.receive(0.0, "coord", m.Call("1", "tune", epoch=3))
+    assert callee.orders()
+
+
+def test_a_refused_call_stays_refused() -> None:
+    callee = _callee(COORD, m.Hello(1, 1, "coordinator", "other", "o1"))
+    callee.receive(0.0, "coord", m.Call("1", "move", epoch=3))
+    callee.receive(0.1, "other", m.Call("2", "move"))
+    callee.finish(1.0, "1", "success")
+    callee.link_down(1.0, "coord", leaves=True)
+    _said(callee)
+    callee.receive(2.0, "other", m.Call("2", "move"))
+    assert _outcome(callee) == ("error", "device_leased", Executed.NO)
+    callee.receive(2.0, "other", m.Call("3", "move"))
+    assert [type(message) for message in _said(callee)] == [m.Accept]
+
+
+def test_busy_is_said_by_the_runner() -> None:
+    callee = _callee()
+    callee.receive(0.0, "coord", m.Call("1", "move", epoch=3))
+    callee.finish(0.0, "1", "error", cause="busy", executed=Executed.NO)
+    assert _outcome(callee) == ("error", "busy", Executed.NO)
+
+
+def test_a_device_takes_orders_from_the_holder_of_its_lease_alone() -> None:
+    other = m.Hello(1, 1, "coordinator", "other", "o1")
+    callee = _callee(COORD, other, m.Hello(1, 1, "node", "vision", "v1"))
+    callee.receive(0.0, "coord", m.Call("1", "move", epoch=3))
+    _said(callee)
+    callee.receive(0.1, "vision", m.Call("2", "move"))
+    assert _outcome(callee) == ("error", "device_needs_coordinator", Executed.NO)
+    callee.link_down(1.0, "coord")
+    callee.receive(9.0, "other", m.Call("3", "move"))
+    assert _outcome(callee)[1] == "device_leased", "its run still goes on"
+    callee.finish(9.1, "1", "error", cause="cancelled")
+    callee.receive(9.2, "other", m.Call("4", "move"))
+    assert _said(callee) == [m.Accept("4")]
+
+
+def test_a_lease_outlives_a_short_break_of_the_link() -> None:
+    callee = _callee(COORD, m.Hello(1, 1, "coordinator", "other", "o1"))
+    callee.receive(0.0, "coord", m.Call("1", "move", epoch=3))
+    callee.finish(0.5, "1", "success")
+    callee.link_down(1.0, "coord")
+    _said(callee)
+    callee.receive(2.9, "other", m.Call("2", "move"))
+    assert _outcome(callee)[1] == "device_leased"
+    callee.receive(3.0, "other", m.Call("3", "move"))
+    assert _said(callee) == [m.Accept("3")]
+
+
+def test_an_id_of_another_caller_is_not_answered_with_his_result() -> None:
+    callee = _callee(COORD, m.Hello(1, 1, "coordinator", "other", "o1"))
+    callee.receive(0.0, "coord", m.Call("1", "get", epoch=3))
+    _said(callee)
+    callee.receive(0.1, "other", m.Call("1", "get"))
+    callee.receive(0.2, "other", m.ResultAck("1"))
+    assert _outcome(callee) == ("error", "id_taken", Executed.NO)
+    welcome = callee.link_up(0.3, "coord", COORD)
+    assert isinstance(welcome, m.Welcome) and welcome.runs == ("1",)
+
+
+@pytest.mark.parametrize("limited_by", ["the call", "the offer"])
+def test_the_deadline_is_enforced_whatever_the_action_says(limited_by: str) -> None:
+    callee = _callee()
+    by_call = limited_by == "the call"
+    callee.receive(1.0, "coord", m.Call("1", "track" if by_call else "limited", {}, 2.0 if by_call else None, 3))
+    callee.orders()
+    assert callee.due() == 3.0
+    callee.advance(2.9)
+    assert callee.orders() == []
+    callee.advance(3.0)
+    callee.advance(4.0)
+    assert callee.orders() == [CancelRun("1", "deadline")]
+    callee.finish(4.1, "1", "success", {"p": 1})
+    assert _outcome(callee) == ("error", "deadline", Executed.YES)
+
+
+def test_an_orphan_is_stopped_after_its_time_unless_its_caller_comes_back() -> None:
+    callee = _callee()
+    for id_, service in (("1", "move"), ("2", "track")):
+        callee.receive(0.0, "coord", m.Call(id_, service, epoch=3))
+    callee.orders()
+    callee.link_down(1.0, "coord")
+    assert callee.due() == 2.0
+    callee.link_up(1.5, "coord", COORD)
+    callee.advance(2.0)
+    assert callee.orders() == []
+    callee.link_down(3.0, "coord")
+    callee.advance(3.9)
+    assert callee.orders() == []
+    callee.advance(4.0)
+    assert callee.orders() == [CancelRun("1", "orphan")], "track has no orphan time and goes on"
+    callee.finish(4.1, "1", "error", cause="cancelled")
+    _said(callee)
+    welcome = callee.link_up(5.0, "coord", COORD)
+    assert isinstance(welcome, m.Welcome) and set(welcome.runs) == {"1", "2"}
+    callee.receive(5.0, "coord", m.Call("1", "move", epoch=3))
+    assert _outcome(callee) == ("error", "orphan", Executed.YES)
+
+
+def test_cancel_against_completion() -> None:
+    callee = _callee()
+    for id_ in "12":
+        callee.receive(0.0, "coord", m.Call(id_, "track", epoch=3))
+        callee.receive(0.1, "coord", m.Cancel(id_, "not wanted"))
+        callee.receive(0.1, "coord", m.Cancel(id_, "again"))
+    assert [order for order in callee.orders() if isinstance(order, CancelRun)] == [
+        CancelRun("1", "not wanted"),
+        CancelRun("2", "not wanted"),
+    ]
+    _said(callee)
+    callee.finish(0.2, "1", "success", {"p": 1})
+    assert _outcome(callee) == ("success", "", Executed.YES), "it had ended before"
+    callee.finish(0.2, "2", "error", cause="cancelled")
+    assert _outcome(callee) == ("error", "cancelled", Executed.YES)
+    callee.receive(0.3, "coord", m.Cancel("2", "again"))
+    assert _outcome(callee) == ("error", "cancelled", Executed.YES), "answered from the stored result"
+
+
+def test_a_cancel_that_overtakes_its_call_keeps_it_from_beginning() -> None:
+    callee = _callee()
+    callee.receive(0.0, "coord", m.Cancel("1", "not wanted"))
+    callee.receive(0.1, "coord", m.Call("1", "track", epoch=3))
+    outcomes = [message for message in _said(callee) if isinstance(message, m.Outcome)]
+    assert {(one.cause, one.executed) for one in outcomes} == {("cancelled", Executed.NO)}
+    assert callee.orders() == []
+
+
+def test_another_caller_cannot_cancel_a_run() -> None:
+    callee = _callee(COORD, m.Hello(1, 1, "client", "other", "o1"))
+    callee.receive(0.0, "coord", m.Call("1", "track", epoch=3))
+    callee.orders()
+    callee.receive(0.1, "other", m.Cancel("1"))
+    assert callee.orders() == []
+
+
+@pytest.mark.parametrize(
+    ("hello", "code"),
+    [
+        (m.Hello(2, 3, "coordinator", "coord", "c9", 9), "version"),
+        (m.Hello(1, 1, "coordinator", "coord", "c0", 2), "old_epoch"),
+        (m.Hello(1, 1, "coordinator", "coord", "c9", 3), "name_taken"),
+        (m.Hello(1, 1, "coordinator", "new", "c9", 1, "d2"), "directory"),
+        (m.Hello(1, 1, "coordinator", "coord", "c1", 3), ""),
+        (m.Hello(1, 1, "coordinator", "coord", "c9", 4), ""),
+        (m.Hello(1, 1, "coordinator", "new", "c9", 1, ""), ""),
+    ],
+)
+def test_who_is_welcome(hello: m.Hello, code: str) -> None:
+    callee = _callee()
+    answer = callee.link_up(1.0, hello.name, hello)
+    assert (answer.code if isinstance(answer, m.Refuse) else "") == code
+    if code == "directory":
+        assert isinstance(answer, m.Refuse) and "copy the same file" in answer.text
+
+
+def test_another_directory_may_be_allowed() -> None:
+    callee = Callee("motion", "n1", OFFERS, directory="d1", any_directory=True)
+    welcome = callee.link_up(0.0, "new", m.Hello(1, 1, "client", "new", "c", 0, "d2"))
+    assert isinstance(welcome, m.Welcome) and welcome.directory == "d1", "it still says which one it has"
+
+
+def test_a_caller_that_was_not_welcomed_runs_nothing() -> None:
+    callee = _callee()
+    callee.receive(0.0, "stranger", m.Call("1", "get"))
+    assert _outcome(callee) == ("error", "not_welcome", Executed.NO)
+
+
+def test_results_are_forgotten_by_number_and_by_time_ids_are_not() -> None:
+    callee = _callee(keeping=Keeping(results=10.0, result_count=2))
+    for n in range(3):
+        callee.receive(float(n), "coord", m.Call(str(n), "get", epoch=3))
+    welcome = callee.link_up(3.0, "coord", COORD)
+    assert isinstance(welcome, m.Welcome) and welcome.runs == ("1", "2")
+    assert callee.due() == 11.0
+    callee.advance(11.0)
+    _said(callee)
+    for id_, cause in (("0", "forgotten"), ("1", "forgotten"), ("2", "")):
+        callee.receive(11.0, "coord", m.Call(id_, "get", epoch=3))
+        assert _outcome(callee)[1] == cause
+
+
+def test_ids_are_forgotten_in_the_end() -> None:
+    callee = _callee(keeping=Keeping(ids=100.0, id_count=2))
+    for n in range(4):
+        callee.receive(0.0, "coord", m.Call(str(n), "get", epoch=3))
+        callee.receive(0.0, "coord", m.ResultAck(str(n)))
+    _said(callee)
+    seen = []
+    for n in (3, 2, 1, 0):
+        callee.receive(0.0, "coord", m.Call(str(n), "get", epoch=3))
+        seen.append(_outcome(callee)[1])
+    assert seen == ["forgotten", "forgotten", "", ""]
+
+
+def test_what_cannot_be_sent_is_an_error_of_the_action() -> None:
+    callee = _callee()
+    callee.receive(0.0, "coord", m.Call("1", "track", epoch=3))
+    outcome = callee.finish(1.0, "1", "success", {"image": object()})
+    assert (outcome.status, outcome.cause, outcome.executed) == ("error", "bad_result", Executed.YES)
+    assert "values.image" in outcome.text
+
+
+def test_commands_go_to_the_node_and_their_answers_back() -> None:
+    callee = _callee()
+    command = m.Command("k1", "hold", "arm")
+    callee.receive(0.0, "coord", command)
+    assert callee.orders() == [Commanded(command, "coord")]
+    callee.answer(0.1, "k1", True, {"arm": "held"})
+    assert callee.messages() == [("coord", m.Answer("k1", True, {"arm": "held"}))]
+
+
+def test_reports_about_what_does_not_go_on_are_the_nodes_own_fault() -> None:
+    callee = _callee()
+    with pytest.raises(ValueError, match="no such run"):
+        callee.finish(0.0, "1", "success")
+    with pytest.raises(ValueError, match="no such run"):
+        callee.feedback(0.0, "1", 0.5)
+    with pytest.raises(ValueError, match="no such run"):
+        callee.raise_event(0.0, "lost", run="1")
+    with pytest.raises(ValueError, match="nobody waits"):
+        callee.answer(0.0, "k1", True)
+
+
+def test_a_service_answered_on_the_spot_is_answered_once_by_either_way() -> None:
+    callee = _callee()
+    outcome = callee.answer_inline(1.0, "coord", m.Call("1", "get", epoch=3))
+    assert outcome == m.Outcome("1", "success", {"at": 1.0}) and not callee.has_work
+    for call in (m.Call("1", "get", epoch=3), m.Call("2", "track", epoch=3), m.Call("3", "nowhere", epoch=3)):
+        assert callee.answer_inline(2.0, "coord", call) is None
+    assert callee.answer_inline(2.0, "coord", m.Call("4", "get", epoch=3, boot="n0")) is None
+    callee.receive(2.0, "coord", m.Call("1", "get", epoch=3))
+    assert _said(callee) == [outcome]
+
+
+def test_callers_that_came_and_went_do_not_fill_the_memory() -> None:
+    callee = Callee("motion", "n1", OFFERS)
+    for n in range(2_000):
+        name = f"client{n}"
+        assert isinstance(callee.link_up(0.0, name, m.Hello(1, 1, "client", name, "b")), m.Welcome)
+        callee.receive(0.0, name, m.Subscribe(("tick",)))
+        callee.link_down(0.0, name)
+    assert len(callee._peers._peers) <= 257
+    assert callee.events.raise_event(m.Event("tick", "timer", 0), False, "")[1] == []

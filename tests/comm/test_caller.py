@@ -1,0 +1,311 @@
+"""The calling end by itself: what each fault ends a call with, and when."""
+
+from __future__ import annotations
+
+import pytest
+
+from services.comm import messages as m
+from services.comm.caller import (
+    Accepted,
+    Answered,
+    Caller,
+    Ended,
+    EventArrived,
+    Late,
+    Notice,
+    PeerBack,
+    PeerLost,
+    Progress,
+)
+from services.comm.messages import Executed
+from services.comm.plain import NotPlainError
+
+HELLO = m.Hello(1, 1, "coordinator", "coord", "c1", 3)
+CALL = m.Call("1", "move", {"to": (1, 2)}, 2.0)
+
+
+def _welcome(boot: str = "n1", runs: tuple[str, ...] = ()) -> m.Welcome:
+    return m.Welcome(1, "motion", boot, ("move",), runs)
+
+
+def _caller(*, up: bool = True, auto_ack: bool = False) -> Caller:
+    caller = Caller("motion", HELLO, auto_ack=auto_ack)
+    if up:
+        caller.link_up(0.0, _welcome())
+        caller.notices()
+    return caller
+
+
+def _ends(notices: list[Notice]) -> list[tuple[str, str, Executed]]:
+    return [
+        (notice.outcome.id, notice.outcome.cause, notice.outcome.executed)
+        for notice in notices
+        if isinstance(notice, Ended)
+    ]
+
+
+def test_a_call_goes_out_with_epoch_and_boot_and_its_arguments_in_plain_types() -> None:
+    caller = _caller()
+    caller.call(0.0, CALL)
+    assert caller.messages(0.0) == [m.Call("1", "move", {"to": [1, 2]}, 2.0, 3, "n1")]
+    assert caller.messages(0.0) == []
+
+
+def test_a_run_from_accept_to_acknowledged_result() -> None:
+    caller = _caller()
+    caller.call(0.0, CALL)
+    result = m.Outcome("1", "success", {"x": 1})
+    for message in (m.Accept("1"), m.Accept("1"), m.Feedback("1", 0.5, {"n": 1}), result, result):
+        caller.receive(0.1, message)
+    assert caller.notices() == [Accepted("1"), Progress("1", 0.5, {"n": 1}), Ended(result)]
+    caller.messages(0.1)
+    assert caller.due() is None, "a result that is not safe yet is not acknowledged"
+    caller.acknowledge(0.2, "1")
+    assert caller.due() == pytest.approx(0.25)
+    assert caller.messages(0.24) == []
+    assert caller.messages(0.25) == [m.ResultAck("1")]
+    assert caller.due() is None
+
+
+def test_acknowledgements_travel_together() -> None:
+    caller = _caller(auto_ack=True)
+    for n in range(64):
+        caller.call(0.0, m.Call(str(n), "move"))
+        caller.receive(0.0, m.Outcome(str(n), "success"))
+    sent = [message for message in caller.messages(0.0) if isinstance(message, m.ResultAck)]
+    assert sent == [m.ResultAck("0", tuple(str(n) for n in range(1, 64)))]
+
+
+def test_a_repeated_result_is_acknowledged_again_and_told_once() -> None:
+    caller = _caller(auto_ack=True)
+    caller.call(0.0, CALL)
+    caller.receive(0.0, m.Outcome("1", "success"))
+    assert m.ResultAck("1") in caller.messages()
+    caller.notices()
+    caller.receive(0.1, m.Outcome("1", "success"))
+    assert caller.messages() == [m.ResultAck("1")] and caller.notices() == []
+
+
+@pytest.mark.parametrize("owns_boot", [False, True], ids=["any boot", "a boot of before"])
+def test_a_call_that_never_leaves_was_not_executed_unless_it_may_have_left_before(owns_boot: bool) -> None:
+    call = m.Call("1", "move", boot="n0" if owns_boot else "")
+    executed = Executed.UNKNOWN if owns_boot else Executed.NO
+    away = _caller(up=False)
+    away.call(0.0, call)
+    assert _ends(away.notices()) == [("1", "unreachable", executed)]
+    waiting = _caller(up=False)
+    waiting.connecting(0.0)
+    waiting.call(0.5, call)
+    assert waiting.notices() == [] and waiting.due() == 2.0
+    waiting.advance(2.0)
+    assert _ends(waiting.notices()) == [("1", "unreachable", executed)]
+    refused = _caller(up=False)
+    refused.link_refused(0.0, m.Refuse("directory", "copy it"))
+    refused.call(0.0, call)
+    assert _ends(refused.notices()) == [("1", "refused", executed)]
+
+
+def test_a_call_made_while_the_link_is_away_leaves_when_it_is_back_even_to_another_boot() -> None:
+    caller = _caller()
+    caller.link_down(1.0, "cut")
+    caller.call(1.5, CALL)
+    assert caller.messages(1.5) == []
+    caller.link_up(2.0, _welcome("n2"))
+    assert caller.messages(2.0) == [m.Call("1", "move", {"to": [1, 2]}, 2.0, 3, "n2")]
+    assert _ends(caller.notices()) == []
+
+
+def test_a_lost_link_ends_its_calls_after_two_seconds_not_before() -> None:
+    caller = _caller()
+    caller.call(0.0, CALL)
+    caller.messages(0.0)
+    caller.link_down(1.0, "the other side hung up")
+    assert caller.notices() == [PeerLost("the other side hung up")] and caller.due() == 1.0
+    caller.advance(2.9)
+    assert caller.notices() == [] and caller.under_way() == ("1",)
+    caller.advance(3.0)
+    assert _ends(caller.notices()) == [("1", "lost", Executed.UNKNOWN)]
+
+
+def test_a_peer_that_was_silent_for_long_ends_its_calls_at_once() -> None:
+    caller = _caller()
+    caller.call(0.0, CALL)
+    caller.link_down(1.0, "silent", final=True)
+    assert _ends(caller.notices()) == [("1", "lost", Executed.UNKNOWN)]
+    caller.call(1.1, m.Call("2", "move"))
+    assert _ends(caller.notices()) == [("2", "unreachable", Executed.NO)]
+
+
+def test_the_same_boot_is_sent_the_call_again_under_its_id_with_its_cancel() -> None:
+    caller = _caller()
+    caller.call(0.0, CALL)
+    caller.call(0.0, m.Call("2", "move"))
+    sent = caller.messages(0.0)
+    caller.cancel(0.1, "2", "not wanted")
+    caller.link_down(1.0, "cut")
+    caller.subscribe(1.0, ("tick",))
+    caller.link_up(1.5, _welcome(runs=("1",)))
+    assert caller.messages(1.5) == [m.Subscribe(("tick",)), *sent, m.Cancel("2", "not wanted")]
+    assert caller.notices()[1:] == [PeerBack("motion", "n1", True, ("move",), ("1",))]
+
+
+def test_another_boot_is_never_sent_what_the_first_was() -> None:
+    caller = _caller()
+    caller.call(0.0, CALL)
+    caller.messages(0.0)
+    caller.link_down(1.0, "cut")
+    caller.link_up(1.5, _welcome("n2"))
+    assert caller.messages(1.5) == []
+    assert _ends(caller.notices()) == [("1", "rebooted", Executed.UNKNOWN)]
+
+
+def test_no_accept_in_time_ends_and_cancels_the_call() -> None:
+    caller = _caller()
+    caller.call(0.0, CALL)
+    caller.messages(0.0)
+    assert caller.due() == 1.0
+    caller.advance(1.0)
+    assert _ends(caller.notices()) == [("1", "not_accepted", Executed.UNKNOWN)]
+    assert caller.messages(1.0) == [m.Cancel("1", "not_accepted")]
+
+
+def test_the_deadline_is_watched_with_a_margin_for_the_nodes_stop_routine() -> None:
+    caller = _caller()
+    caller.call(0.0, CALL)
+    caller.receive(0.1, m.Accept("1"))
+    caller.messages(0.1)
+    caller.notices()
+    assert caller.due() == 7.0
+    caller.advance(6.9)
+    assert caller.notices() == []
+    caller.advance(7.0)
+    assert _ends(caller.notices()) == [("1", "no_answer", Executed.UNKNOWN)]
+    assert caller.messages(7.0) == [m.Cancel("1", "no_answer")]
+
+
+def test_a_cancelled_call_that_never_ends_is_given_up() -> None:
+    caller = _caller()
+    caller.call(0.0, m.Call("1", "move"))
+    caller.receive(0.1, m.Accept("1"))
+    caller.cancel(1.0, "1", "not wanted")
+    caller.cancel(1.1, "1", "again")
+    assert [one for one in caller.messages(1.1) if isinstance(one, m.Cancel)] == [m.Cancel("1", "not wanted")]
+    caller.notices()
+    caller.advance(6.0)
+    assert _ends(caller.notices()) == [("1", "no_answer", Executed.UNKNOWN)]
+
+
+def test_a_call_cancelled_before_it_leaves_ends_at_once() -> None:
+    caller = _caller(up=False)
+    caller.connecting(0.0)
+    caller.call(0.0, CALL)
+    caller.cancel(0.1, "1", "not wanted")
+    assert _ends(caller.notices()) == [("1", "cancelled", Executed.NO)]
+    caller.link_up(0.2, _welcome())
+    assert caller.messages(0.2) == []
+
+
+def test_a_call_of_before_a_restart_is_cancelled_on_the_node_although_it_was_not_sent_again_yet() -> None:
+    caller = _caller(up=False)
+    caller.connecting(0.0)
+    caller.call(0.0, m.Call("1", "move", boot="n1"))
+    caller.cancel(0.1, "1", "not wanted")
+    caller.link_up(0.2, _welcome())
+    assert [type(message) for message in caller.messages(0.2)] == [m.Call, m.Cancel]
+
+
+def test_a_run_given_up_is_stopped_when_its_node_is_back_and_its_end_is_late() -> None:
+    caller = _caller()
+    caller.call(0.0, CALL)
+    caller.messages(0.0)
+    caller.link_down(1.0, "silent", final=True)
+    caller.link_up(5.0, _welcome(runs=("1",)))
+    assert caller.messages(5.0) == [m.Cancel("1", "given up")]
+    caller.notices()
+    late = m.Outcome("1", "error", {}, "orphan")
+    caller.receive(5.1, late)
+    assert caller.notices() == [Late(late)]
+    assert caller.messages() == [m.ResultAck("1")]
+
+
+def test_after_a_restart_the_owner_settles_what_the_node_still_keeps() -> None:
+    caller = _caller()
+    caller.acknowledge(0.0, "done before")
+    caller.disown(0.0, "given up before")
+    assert set(caller.messages()) == {m.ResultAck("done before"), m.Cancel("given up before", "disowned")}
+
+
+def test_the_children_of_a_call_are_cancelled_with_it() -> None:
+    caller = _caller()
+    for id_, parent in (("1", "p"), ("2", "q"), ("3", "p")):
+        caller.call(0.0, m.Call(id_, "move", parent=parent))
+    caller.messages(0.0)
+    caller.cancel_children(0.1, "p", "its parent is over")
+    assert caller.messages(0.1) == [m.Cancel("1", "its parent is over"), m.Cancel("3", "its parent is over")]
+
+
+def test_commands_are_answered_come_what_may() -> None:
+    caller = _caller()
+    for id_ in "abc":
+        caller.command(0.0, m.Command(id_, "hold"))
+    caller.receive(0.1, m.Answer("a", True, {"arm": "held"}))
+    caller.receive(0.1, m.Answer("a", True, {"arm": "held"}))
+    assert caller.notices() == [Answered(m.Answer("a", True, {"arm": "held"}))]
+    assert caller.due() == 2.0
+    caller.advance(2.0)
+    assert caller.notices() == [Answered(m.Answer(id_, False, {"cause": "no_answer"})) for id_ in "bc"]
+    caller.command(3.0, m.Command("d", "hold"))
+    caller.link_down(3.1, "cut")
+    caller.command(3.2, m.Command("e", "hold"))
+    answers = [notice.answer for notice in caller.notices() if isinstance(notice, Answered)]
+    assert answers == [m.Answer("d", False, {"cause": "lost"}), m.Answer("e", False, {"cause": "unreachable"})]
+
+
+@pytest.mark.parametrize("auto_ack", [True, False])
+def test_each_event_of_a_source_arrives_once_and_is_acknowledged_when_it_is_safe(auto_ack: bool) -> None:
+    caller = _caller(auto_ack=auto_ack)
+    events = [m.Event("caught", "barrier", n) for n in (1, 2, 2, 1)]
+    for event in events:
+        caller.receive(0.0, event)
+    assert caller.notices() == [EventArrived(event) for event in events[:2]]
+    if not auto_ack:
+        assert caller.messages() == []
+        caller.acknowledge_event(0.1, events[1])
+        assert caller.messages() == [m.EventAck("barrier", 2)]
+        caller.receive(0.2, events[0])
+        assert caller.messages() == [m.EventAck("barrier", 1)], "its acknowledgement was lost: again"
+    else:
+        assert set(caller.messages()) == {m.EventAck("barrier", 1), m.EventAck("barrier", 2)}
+    caller.link_up(1.0, _welcome("n2"))
+    caller.notices()
+    caller.receive(1.0, events[0])
+    assert caller.notices() == [EventArrived(events[0])], "another boot counts anew"
+
+
+def test_a_pulse_is_told_each_time() -> None:
+    caller = _caller()
+    pulse = m.Event("tick", "timer", 0)
+    caller.receive(0.0, pulse)
+    caller.receive(0.0, pulse)
+    assert caller.notices() == [EventArrived(pulse)] * 2 and caller.messages() == []
+
+
+def test_lock_step_says_hello_by_itself() -> None:
+    caller = _caller(up=False)
+    caller.open(0.0)
+    caller.call(0.0, CALL)
+    assert caller.messages(0.0) == [HELLO]
+    caller.receive(0.004, _welcome())
+    assert [type(message) for message in caller.messages(0.004)] == [m.Call]
+    caller.receive(0.1, m.Bye("done"))
+    assert caller.notices()[-1] == PeerLost("done")
+
+
+def test_bad_calls_are_refused_where_they_are_made() -> None:
+    caller = _caller()
+    with pytest.raises(NotPlainError, match=r"arguments\.to"):
+        caller.call(0.0, m.Call("1", "move", {"to": object()}))
+    caller.call(0.0, CALL)
+    with pytest.raises(ValueError, match="under way already"):
+        caller.call(0.0, CALL)
+    assert caller.under_way() == ("1",)

@@ -1,0 +1,159 @@
+"""Latched events on their way to several callers, over lost links."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.comm import messages as m
+from services.comm.callee import Callee, Offer
+from services.comm.caller import Caller, EventArrived
+from services.comm.events import KEPT, EventBoard
+
+
+def _node(*names: str, role: str = "coordinator") -> Callee:
+    callee = Callee("motion", "n1", {"move": Offer()})
+    for name in names:
+        callee.link_up(0.0, name, m.Hello(1, 1, role, name, "b"))
+    return callee
+
+
+def _heard(callee: Callee, peer: str) -> list[tuple[str, int]]:
+    return [
+        (message.name, message.number)
+        for to, message in callee.messages()
+        if to == peer and isinstance(message, m.Event)
+    ]
+
+
+def test_a_latched_event_waits_for_a_coordinator_that_is_away() -> None:
+    callee = _node("coord")
+    callee.receive(0.0, "coord", m.Subscribe(("caught",)))
+    callee.link_down(1.0, "coord")
+    callee.raise_event(1.1, "caught", source="barrier", latched=True)
+    callee.raise_event(1.1, "tick", source="timer")
+    assert callee.messages() == []
+    callee.link_up(2.0, "coord", m.Hello(1, 1, "coordinator", "coord", "b"))
+    assert _heard(callee, "coord") == [("caught", 1)]
+
+
+def test_a_latched_event_raised_before_anybody_asked_is_kept() -> None:
+    callee = _node("coord")
+    callee.raise_event(0.0, "caught", latched=True)
+    callee.receive(0.1, "coord", m.Subscribe(("caught",)))
+    assert _heard(callee, "coord") == [("caught", 1)]
+    callee.receive(0.2, "coord", m.EventAck("motion", 1))
+    callee.receive(0.3, "coord", m.Subscribe(("caught",)))
+    assert _heard(callee, "coord") == []
+
+
+def test_an_acknowledgement_covers_only_what_its_sender_asked_for() -> None:
+    callee = _node("coord")
+    callee.receive(0.0, "coord", m.Subscribe(("a",)))
+    for name in ("a", "b", "a"):
+        callee.raise_event(0.0, name, source="s", latched=True)
+    assert _heard(callee, "coord") == [("a", 1), ("a", 3)]
+    callee.receive(0.1, "coord", m.EventAck("s", 3))
+    callee.receive(0.2, "coord", m.Subscribe(("a", "b")))
+    assert _heard(callee, "coord") == [("b", 2)]
+
+
+def test_an_event_is_forgotten_when_the_last_coordinator_has_it() -> None:
+    callee = _node("one", "two")
+    for name in ("one", "two"):
+        callee.receive(0.0, name, m.Subscribe(("caught",)))
+    callee.raise_event(0.0, "caught", latched=True)
+    assert {to for to, _ in callee.messages()} == {"one", "two"}
+    callee.receive(0.1, "one", m.EventAck("motion", 1))
+    assert [event.number for event in callee.events.waiting("two")] == [1]
+    callee.receive(0.1, "two", m.EventAck("motion", 1))
+    callee.receive(0.2, "two", m.Subscribe(("caught",)))
+    assert _heard(callee, "two") == []
+
+
+def test_an_event_of_a_run_goes_to_its_caller_and_is_gone_with_the_run() -> None:
+    callee = _node("coord", "other")
+    callee.receive(0.0, "other", m.Subscribe(("ball_lost",)))
+    callee.receive(0.0, "coord", m.Call("1", "move"))
+    event = callee.raise_event(0.1, "ball_lost", {"at": 1}, run="1", latched=True)
+    assert event == m.Event("ball_lost", "motion", 1, {"at": 1}, "1")
+    assert [to for to, message in callee.messages() if message == event] == ["coord"]
+    callee.link_down(0.2, "coord")
+    callee.finish(0.3, "1", "success")
+    callee.link_up(0.4, "coord", m.Hello(1, 1, "coordinator", "coord", "b"))
+    assert _heard(callee, "coord") == [("ball_lost", 1)]
+    callee.receive(0.5, "coord", m.ResultAck("1"))
+    callee.link_up(0.6, "coord", m.Hello(1, 1, "coordinator", "coord", "b"))
+    assert _heard(callee, "coord") == []
+
+
+def test_one_that_leaves_in_good_order_is_sent_nothing_when_it_is_back() -> None:
+    callee = _node("coord")
+    callee.receive(0.0, "coord", m.Subscribe(("caught",)))
+    callee.receive(0.1, "coord", m.Bye("done"))
+    callee.raise_event(0.2, "caught", latched=True)
+    callee.link_up(0.3, "coord", m.Hello(1, 1, "coordinator", "coord", "b2"))
+    assert _heard(callee, "coord") == []
+    callee.receive(0.4, "coord", m.Subscribe(("caught",)))
+    assert _heard(callee, "coord") == [("caught", 1)]
+
+
+def test_what_nobody_fetches_gives_way_and_is_counted() -> None:
+    board = EventBoard()
+    for _ in range(KEPT + 3):
+        board.raise_event(m.Event("caught", "barrier", 0), True, "")
+    waiting = board.subscribe("coord", ("caught",), True)
+    assert (board.lost, len(waiting), waiting[0].number) == (3, KEPT, 4)
+
+
+_steps = st.lists(st.sampled_from(["raise a", "raise b", "cut", "connect", "carry", "ack"]), max_size=40)
+
+
+@given(_steps, st.integers(0, 3))
+def test_every_latched_event_arrives_once_and_in_order_of_its_source(steps: list[str], lost: int) -> None:
+    callee = Callee("motion", "n1", {})
+    caller = Caller("motion", m.Hello(1, 1, "coordinator", "coord", "b"))
+    caller.subscribe(0.0, ("a", "b"))
+    raised: list[m.Event] = []
+    arrived: list[m.Event] = []
+    towards: list[m.Message] = []
+
+    def connect() -> None:
+        if not caller.up:
+            answer = callee.link_up(0.0, "coord", caller.hello)
+            assert isinstance(answer, m.Welcome)
+            caller.link_up(0.0, answer)
+            carry()
+
+    def carry() -> None:
+        for message in caller.messages(0.0):
+            callee.receive(0.0, "coord", message)
+        towards.extend(message for _, message in callee.messages())
+        while towards and caller.up:
+            caller.receive(0.0, towards.pop(0))
+
+    def cut() -> None:
+        if caller.up:
+            towards.extend(message for _, message in callee.messages())
+            while len(towards) > lost:
+                caller.receive(0.0, towards.pop(0))
+            towards.clear()
+            callee.link_down(0.0, "coord")
+            caller.link_down(0.0, "cut")
+
+    def take() -> None:
+        arrived.extend(notice.event for notice in caller.notices() if isinstance(notice, EventArrived))
+
+    for step in [*steps, "connect", "carry", "ack"]:
+        if step.startswith("raise"):
+            raised.append(callee.raise_event(0.0, step[-1], source="s", latched=True))
+        elif step == "ack":
+            take()
+            for event in arrived:
+                caller.acknowledge_event(0.0, event)
+            carry()
+        else:
+            {"cut": cut, "connect": connect, "carry": carry}[step]()
+        take()
+    assert arrived == raised
+    assert callee.events.waiting("coord") == []
