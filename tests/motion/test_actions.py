@@ -177,7 +177,7 @@ def test_a_ball_that_sticks_is_an_error(play: Any) -> None:
     play.device.state = play.rig.arm.state()
     result = play.play(actions.empty_and_home(play, attempts=2))
     assert (result.status, result.cause) == (Status.ERROR, "cup_not_empty")
-    assert [body.get("pose") for body in play.device.sent] == ["empty", "home"] * 2
+    assert [body.get("pose") for body in play.device.sent] == ["home", *["empty", "home"] * 2]
 
 
 def test_reset_and_home_recovers_from_a_fault(play: Any) -> None:
