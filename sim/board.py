@@ -1,8 +1,13 @@
-"""Board images as somebody would take them in the simulated laboratory: laid on the table at measured places, and held by hand."""
+"""Board images as somebody would take them in the simulated laboratory: laid on the table at measured places, and held by hand.
+
+`python -m sim.board DIR` saves them as `petrobot calibrate --views DIR` reads them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import argparse
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +17,9 @@ from numpy.typing import NDArray
 
 from sim.camera import Array, PinholeCamera
 from sim.scenery import Chessboard
+from sim.truth import read_toml, read_truth
+
+CELL = Path(__file__).parents[1] / "services" / "cell.toml"
 
 PLACEMENT = 0.0003
 """m, standard deviation of where the board really lies around where it was measured to lie."""
@@ -91,3 +99,30 @@ def _turned(x: float, y: float, z: float) -> Array:
     about_y = np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
     about_z = np.array([[cz, -sz, 0.0], [sz, cz, 0.0], [0.0, 0.0, 1.0]])
     return np.asarray(about_z @ about_y @ about_x)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Save board images of the simulated camera as it truly hangs; gives the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m sim.board",
+        description="Save images of a calibration board taken by the simulated camera.",
+        epilog="example:\n  python -m sim.board board_images && petrobot calibrate --views board_images",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("folder", type=Path, help="folder for view01.png, ... and views.toml")
+    parser.add_argument("--seed", type=int, default=1, help="of noise and of how the boards really lie (default 1)")
+    options = parser.parse_args(argv)
+    cell = read_toml(CELL)
+    truth = read_truth(cell)
+    view = {
+        key: getattr(truth.camera, key) for key in ("position", "rotation", "focal_px", "principal_px", "distortion")
+    }
+    view |= {"table_top": truth.table.top, "near_edge": truth.table.near_edge}
+    rng = np.random.default_rng(options.seed)
+    save_board_views(options.folder, cell, PinholeCamera(cell, view, rng), rng)
+    print(f"{len(LAID) + len(HELD)} images saved to {options.folder}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -21,6 +21,7 @@ from services.vision.calibration_file import (
 )
 from services.vision.optics import Array, Optics
 from sim.board import HELD, LAID, board_views, save_board_views
+from sim.board import main as board_command
 from sim.camera import PinholeCamera
 from tests.vision.test_optics import drawn_optics
 
@@ -244,3 +245,13 @@ def test_measured_places_differ_from_true_ones(cell: dict[str, Any], pinhole: Pi
     assert first is not None and stated is not None
     wanted = pinhole.project(Board().points() @ stated[:3, :3].T + stated[:3, 3])
     assert 0.01 < np.abs((first - wanted).mean(axis=0)).max() < 0.6
+
+
+@pytest.mark.proof
+def test_shipped_calibration_is_what_the_commands_make(tmp_path: Path, pinhole: PinholeCamera) -> None:
+    """The two commands of docs/vision.md, from the simulated camera's images to the shipped file."""
+    assert board_command([str(tmp_path / "views")]) == 0
+    assert command.calibrate_main(["--views", str(tmp_path / "views"), "--output", str(tmp_path / "made.toml")]) == 0
+    made = parse_calibration((tmp_path / "made.toml").read_text(encoding="utf-8"), "made.toml")
+    shipped = parse_calibration(DEFAULT.read_text(encoding="utf-8"), DEFAULT.name)
+    assert table_error(made.optics, shipped.optics).max() < 0.02e-3
