@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from coordinator.conditions.wording import Severity, nearest
 from coordinator.engine.draft import Draft
-from coordinator.engine.firing import Match, arcs_satisfied, fire, forget_flags
+from coordinator.engine.firing import Match, arcs_satisfied, fire
 from coordinator.engine.instructions import Marked
 from coordinator.engine.state import LIVE, Mode, Phase, Run
 from coordinator.engine.step import MOVING, Policy, pause, release, resume, settle
@@ -36,7 +36,6 @@ def remove_tokens(draft: Draft, policy: Policy, command: RemoveTokens) -> None:
         refuse(draft, f"{command.place} holds only {draft.marking[p]} tokens", command.place)
         return
     _mark(draft, p, -command.tokens)
-    forget_flags(draft)
     settle(draft, policy, "RemoveTokens")
 
 

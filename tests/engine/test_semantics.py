@@ -224,6 +224,24 @@ def test_timeless_cycle_pauses(play: Plays) -> None:
     assert len(p.fired) == 10 and p.state.mode is Mode.PAUSED and p.reports == ["timeless"]
 
 
+def test_time_between_stimuli_makes_firings_no_cycle(play: Plays) -> None:
+    net = {"t": {"in": "x", "out": "y", "event": "e"}, "u": {"in": "y", "out": "z"}, "v": {"in": "z", "out": "x"}}
+    p = play("x=1 y z", net, "e", policy=Policy(firing_limit=4))
+    p(EventOccurred("e"), EventOccurred("e"))
+    assert len(p.fired) == 6 and p.reports == []
+
+
+def test_step_orders_transitions_so_that_none_bars_the_next(play: Plays) -> None:
+    net = {
+        "t": {"in": "x", "out": "y", "event": "e"},
+        "u": {"in": "v !y", "out": "z", "event": "e"},
+        "w": {"in": "r !z", "event": "e"},
+    }
+    p = play("x=1 y v=1 z r=1", net, "e")
+    p(EventOccurred("e"))
+    assert p.fired == ["w", "u", "t"]
+
+
 def test_step_is_judged_on_one_marking(play: Plays) -> None:
     net = {"t": {"in": "x !y", "out": "z", "event": "e"}, "u": {"in": "w", "out": "y", "event": "e"}}
     p = play("x=1 y w=1 z", net, events="e")
@@ -363,6 +381,25 @@ def test_after_timer_starts_anew_for_another_run(play: Plays) -> None:
     assert p.fired == ["retry", "long"] and p.marked == {"z": 1}
 
 
+def test_timer_starts_anew_after_its_own_firing(play: Plays) -> None:
+    p = play("x=2 y", {"late": {"in": "x", "out": "y", "after": 2.0}})
+    p(TimerFired(p.of(ArmTimer)[0].key))
+    assert p.fired == ["late"] and len(p.of(ArmTimer)) == 2
+    p(TimerFired(p.of(ArmTimer)[1].key))
+    assert p.fired == ["late", "late"]
+
+
+def test_timer_belongs_to_the_run_that_it_would_take(play: Plays) -> None:
+    net = {"t": {"in": "a:normal"}, "long": {"in": "a:preempt=failure", "out": "z", "after": 9.0}}
+    p = play("a!2=2 z", net)
+    p(RunEnded("a#1", OK))
+    first, second = p.of(ArmTimer)
+    p(TimerFired(first.key))
+    assert p.fired == ["t"]
+    p(TimerFired(second.key))
+    assert p.fired == ["t", "long"]
+
+
 def test_elapsed_timer_waits_for_its_condition(play: Plays) -> None:
     p = play("x=1 y", {"t": {"in": "x", "out": "y", "after": 1.0, "when": "ready"}}, variables={"ready": False})
     p(TimerFired(p.of(ArmTimer)[0].key))
@@ -378,6 +415,12 @@ def test_servers_run_at_once_and_the_rest_queue_first_in_first_out(play: Plays) 
     assert p.started == ["a#1", "a#2", "a#3"] and p.marked == {"a": 3, "done": 1}
     p(RunEnded("a#1", ERR), RunEnded("a#3", OK))
     assert p.started[-1] == "a#4" and p.reports == []
+
+
+def test_first_done_is_first_taken(play: Plays) -> None:
+    p = play("a!2=2 shut=1 go", {"t": {"in": "a:normal go"}, "open": {"in": "shut", "out": "go", "event": "e"}}, "e")
+    p(RunEnded("a#2", OK), RunEnded("a#1", OK), EventOccurred("e"))
+    assert p.of(Fired)[-1].runs == ("a#2",)
 
 
 def test_second_token_in_a_one_safe_place_is_reported_and_waits(play: Plays) -> None:
