@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -95,6 +95,9 @@ class Observer(Protocol):
     def progress(self, now: float, run: str, notice: Progress) -> None:
         """A run says how far it is."""
 
+    def settled(self, now: float, state: State) -> None:
+        """The engine has handled a stimulus, with this state after it."""
+
 
 class Forgetful:
     """The store of a run without a journal."""
@@ -116,9 +119,18 @@ class FirstAlternative:
 
     def __init__(self, chosen: Mapping[str, str] | None = None) -> None:
         self._chosen = dict(chosen or {})
+        self._overridden: dict[str, str] = {}
+
+    def override(self, task: str, action: str | None) -> None:
+        """The operator chooses for a primitive task from now on; None: free choice again."""
+        self._overridden.pop(task, None)
+        if action is not None:
+            self._overridden[task] = action
 
     def choose(self, task: str, run: str, alternatives: tuple[str, ...]) -> tuple[str, str]:
         """The user's choice for this primitive task, else the first."""
+        if task in self._overridden:
+            return self._overridden[task], "chosen by the operator"
         if task in self._chosen:
             return self._chosen[task], "chosen by the user"
         return alternatives[0], "first of the task file"
@@ -156,6 +168,8 @@ class Executor:
     store: Store = field(default_factory=Forgetful)
     observers: list[Observer] = field(default_factory=list)
     finished: Finished | None = None
+    on_status: Callable[[Mapping[str, Any]], None] | None = None
+    """Gets what nodes answer to the operator's questions."""
 
     def __post_init__(self) -> None:
         """Start with the engine's initial state."""
@@ -213,6 +227,7 @@ class Executor:
             observer.stimulus(now, stimulus)
             for instruction in instructions:
                 observer.instruction(now, instruction)
+            observer.settled(now, state)
         self.finished = next((i for i in instructions if isinstance(i, Finished)), self.finished)
 
     def _rejoin(self, now: float, start: StartRun) -> None:
@@ -307,6 +322,8 @@ class Executor:
                 self.finished = instruction
             elif type(instruction) in self._carry_out:
                 self._effects.append(instruction)
+        for observer in self.observers:
+            observer.settled(now, self.state)
 
     def _choose(self, choose: Choose) -> Chosen:
         if choose.subject is Subject.ACTION:
@@ -364,8 +381,12 @@ class Executor:
 
     def _answered(self, answer: Answer) -> None:
         run = self._commands.pop(answer.id, None)
-        if run is not None:
-            said = str(answer.data.get("answer", "")).replace(" ", "_")
+        if run is None:
+            if self.on_status is not None and "devices" in answer.data:
+                self.on_status(answer.data)
+        elif run in self._flights:
+            answers = answer.data.get("answers", {})
+            said = str(answers.get(self._flights[run].device, "")).replace(" ", "_")
             known = {Hold.HELD.value: Hold.HELD, Hold.STOPPED.value: Hold.STOPPED}
             self._queue.append(RunHeld(run, known.get(said, Hold.CANNOT) if answer.ok else Hold.CANNOT))
 

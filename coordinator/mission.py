@@ -93,6 +93,9 @@ class Tally:
     def progress(self, now: float, run: str, notice: Progress) -> None:
         """Nothing to count."""
 
+    def settled(self, now: float, state: State) -> None:
+        """Nothing to count."""
+
     def _cycle(self, now: float, before: Marking, after: Marking) -> None:
         if self.runs_place is None or after[self.runs_place] >= before[self.runs_place]:
             return

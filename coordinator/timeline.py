@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+from coordinator.engine import State
 from coordinator.engine.instructions import Fired, Instruction, Report, RunRecorded, StartRun
 from coordinator.engine.stimuli import Stimulus
 from coordinator.task import Status
@@ -68,6 +69,9 @@ class Timeline:
 
     def progress(self, now: float, run: str, notice: Progress) -> None:
         """Progress is not kept."""
+
+    def settled(self, now: float, state: State) -> None:
+        """States are not kept."""
 
     def _since(self, now: float) -> float:
         if self.origin is None:

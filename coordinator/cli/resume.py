@@ -21,9 +21,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     from pathlib import Path
 
+    from coordinator.cli.run import add_page_arguments
+
     parser.add_argument("run", help="a run's id or folder, or `last`")
     parser.add_argument("--json", metavar="FILE", help="write the result as JSON (- for standard output)")
     parser.add_argument("--report", metavar="FOLDER", type=Path, help="leave a report in this folder")
+    add_page_arguments(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress in the terminal")
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractAsyncContextManager, contextmanager, nullcontext
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ from coordinator.cli.loading import add_services_argument, load_directory, load_
 if TYPE_CHECKING:
     from coordinator.launch import Setting
     from coordinator.mission import Mission
+    from coordinator.realtime import RealtimeMission
     from coordinator.recording import JournalStore
     from coordinator.task import Task
     from coordinator.timeline import Timeline
@@ -56,9 +58,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=Path("runs"),
         help="where real-time runs are kept (default: %(default)s)",
     )
+    add_page_arguments(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress in the terminal")
     add_services_argument(parser)
     parser.set_defaults(folder=None)
+
+
+def add_page_arguments(parser: argparse.ArgumentParser) -> None:
+    """Whether and where the operator's page is served while a real-time run goes on."""
+    parser.add_argument("--no-page", action="store_true", help="serve no operator's page")
+    parser.add_argument(
+        "--page-port", type=int, default=0, metavar="PORT", help="the page's port (default: a free one)"
+    )
 
 
 def run(options: argparse.Namespace) -> int:
@@ -263,12 +274,38 @@ async def drive(
             shell = RealtimeMission(mission, directory, key_of(directory))
             try:
                 await shell.connect()
-                with _progress(options) as watch:
-                    await _watched(shell.run(begin), mission, watch)
+                async with _page(shell, options):
+                    with _progress(options) as watch:
+                        await _watched(shell.run(begin), mission, watch)
             finally:
                 await shell.close()
     except (UnreachableError, LaunchError) as fault:
         raise CommandError(3, str(fault)) from fault
+
+
+@asynccontextmanager
+async def _page(shell: RealtimeMission, options: argparse.Namespace) -> AsyncIterator[None]:
+    """The operator's page, while the mission run goes on."""
+    if options.no_page:
+        yield
+        return
+    from coordinator.cli.loading import SHIPPED
+    from coordinator.executor import FirstAlternative
+    from coordinator.hmi.journals import JournalHistory
+    from coordinator.hmi.server import start_page
+    from coordinator.operation import Operation
+
+    selector = shell.mission.executor.selector
+    assert isinstance(selector, FirstAlternative)
+    operation = Operation(shell, selector)
+    history = JournalHistory(getattr(options, "journal", Path("runs")))
+    page = await start_page(operation, tasks_folder=SHIPPED, port=options.page_port, history=history)
+    print(f"page: {page.url}", file=sys.stderr, flush=True)
+    try:
+        yield
+    finally:
+        await page.close()
+        await operation.close()
 
 
 def _nodes(directory: Directory, options: argparse.Namespace) -> AbstractAsyncContextManager[Any]:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from coordinator.conditions.wording import Severity
+from coordinator.engine.compiled import Exit
 from coordinator.engine.draft import Draft
 from coordinator.engine.firing import Claims, Match, eligible_runs, match
 from coordinator.task import End
@@ -24,16 +25,25 @@ def choose_step(draft: Draft, pulse: str, choices: Sequence[str], only: Sequence
 
     `choices` are the outcomes of earlier draws for this same step. Looks at the dirty transitions and forgets them.
     """
-    exits = draft.compiled.exits
-    fireable: list[Match] = []
-    for t in sorted(draft.dirty):
-        x = exits[t]
-        if not (x.pulse and only is not None and x.name not in only) and (found := match(draft, x, pulse)):
-            fireable.append(found)
+    fireable = [found for x in _marked(draft, pulse, only) if (found := match(draft, x, pulse))]
     draft.dirty.clear()
     if len(fireable) < 2:
         return fireable
     return _settle(draft, pulse, sorted(fireable, key=_rank_and_place), list(choices))
+
+
+def _marked(draft: Draft, pulse: str, only: Sequence[str] | None) -> Iterator[Exit]:
+    """The dirty transitions that the pulse may serve and whose input places hold enough: a cheap sieve before `match`."""
+    exits, marking = draft.compiled.exits, draft.marking
+    for t in sorted(draft.dirty):
+        x = exits[t]
+        if x.pulse and (x.pulse != pulse or (only is not None and x.name not in only)):
+            continue
+        for p, w in x.takes:
+            if marking[p] < w:
+                break
+        else:
+            yield x
 
 
 def _settle(draft: Draft, pulse: str, rest: list[Match], choices: list[str]) -> list[Match] | Draw:

@@ -14,17 +14,24 @@ function shape(d) {
 
 class Frame {
   constructor(source) {
-    this.image = h("img", { alt: `Image of ${words(source)}` });
-    this.over = s("svg", { preserveAspectRatio: "xMidYMid meet" });
+    this.image = s("image", { x: 0, y: 0 });
+    this.over = s("g");
+    this.picture = s("svg", { class: "picture", role: "img", "aria-label": `Image of ${words(source)}`, preserveAspectRatio: "xMinYMid meet" }, this.image, this.over);
     this.note = h("span", {});
-    this.root = h("figure", { class: "camera" }, h("div", { class: "picture" }, this.image, this.over), h("figcaption", {}, h("strong", {}, words(source)), this.note));
+    this.root = h("figure", { class: "camera" }, this.picture, h("figcaption", {}, h("strong", {}, words(source)), this.note));
   }
 
   update(image) {
-    attribute(this.image, "src", `data:${/^image\/(jpeg|png|webp)$/.test(image.mime) ? image.mime : "image/jpeg"};base64,${image.data}`);
-    attribute(this.over, "viewBox", `0 0 ${Number(image.width)} ${Number(image.height)}`);
+    const [width, height] = [Number(image.width) || 1, Number(image.height) || 1];
+    attribute(this.picture, "viewBox", `0 0 ${width} ${height}`);
+    this.picture.style.aspectRatio = `${width} / ${height}`;
+    attribute(this.image, "width", width);
+    attribute(this.image, "height", height);
+    const mime = /^image\/(jpeg|png|webp)$/.test(image.mime) ? image.mime : "image/jpeg";
+    attribute(this.image, "href", `data:${mime};base64,${image.data}`);
     const seen = image.detections ?? [];
-    fill(this.over, seen.map(shape), seen.filter((d) => d.label).map((d) => s("text", { class: "detection-label", x: (d.x ?? 0) + (d.r ?? 0) + 6, y: (d.y ?? 0) - 6 }, d.label)));
+    const label = (d) => s("text", { class: "detection-label", "font-size": Math.max(10, height / 20), x: (d.x ?? 0) + (d.r ?? 0) + 6, y: (d.y ?? 0) - 6 }, d.label);
+    fill(this.over, seen.map(shape), seen.filter((d) => d.label).map(label));
     text(this.note, [image.age !== undefined ? `${Math.round(image.age * 1000)} ms old` : "", image.note].filter(Boolean).join(" · "));
   }
 }

@@ -48,8 +48,9 @@ export const path = (c) =>
 
 function hits(c, element) {
   let worst = 0;
-  for (let f = 0.08; f < 0.95; f += 0.08) {
-    const [x, y] = at(c, f);
+  const steps = Math.max(10, Math.min(60, Math.round(Math.hypot(c[4] - c[0], c[5] - c[1]) / 16)));
+  for (let i = 1; i < steps; i++) {
+    const [x, y] = at(c, i / steps);
     const reach = element.shape === "place" ? PLACE_R : BAR_H / 2;
     const wide = element.shape === "place" ? PLACE_R : BAR_W / 2;
     const over = Math.min(wide + CLEAR - Math.abs(x - element.x), reach + CLEAR - Math.abs(y - element.y));
@@ -105,4 +106,34 @@ export function pips(count) {
     [[-d, d * 0.7], [d, d * 0.7], [0, -d * 0.8]],
     [[-d * 0.85, -d * 0.85], [d * 0.85, -d * 0.85], [-d * 0.85, d * 0.85], [d * 0.85, d * 0.85]],
   ][count] ?? null;
+}
+
+const STEEP = Math.cos((38 * Math.PI) / 180);
+
+/** Where an element's label stands free of its arcs: below, else above, right or left of it. */
+export function labelSide(element, curves) {
+  const blocked = new Set();
+  for (const c of curves) {
+    for (const [x, y] of [[c[0], c[1]], [c[4], c[5]]]) {
+      const [dx, dy] = [x - element.x, y - element.y];
+      const length = Math.hypot(dx, dy) || 1;
+      if (length > PLACE_R + 8 || (element.shape !== "place" && length > BAR_H / 2 + 8)) continue;
+      if (dy / length > STEEP) blocked.add("below");
+      if (-dy / length > STEEP) blocked.add("above");
+      if (Math.abs(dx) / length > 0.3) blocked.add(dx > 0 ? "right" : "left");
+    }
+  }
+  return ["below", "above", "right", "left"].find((side) => !blocked.has(side)) ?? "below";
+}
+
+/** Positions of label and caption for a side: [x, y of label, y of caption, text-anchor]. */
+export function labelAt(element, side) {
+  const isPlace = element.shape === "place";
+  const half = isPlace ? PLACE_R : BAR_H / 2;
+  if (side === "right" || side === "left") {
+    const out = (isPlace ? PLACE_R : BAR_W / 2) + 8;
+    return side === "right" ? [out, 0, 14, "start"] : [-out, 0, 14, "end"];
+  }
+  if (side === "above") return [0, isPlace && element.sub ? -half - 24 : -half - 10, isPlace ? -half - 10 : -half - 24, "middle"];
+  return [0, half + (isPlace ? 18 : 17), isPlace ? half + 32 : -half - 9, "middle"];
 }

@@ -84,7 +84,7 @@ class Screen {
     const marking = this.reel.marking(this.index);
     const shown = tokensOf(task, marking);
     const { view } = this.canvas;
-    view.alarm(alarmed(task, marking));
+    view.alarm(alarmed(task, marking, this.reel.firings.filter((f) => f.index <= this.index).map((f) => f.transition)));
     if (moving && this.index) for (const firing of this.reel.records[this.index - 1].firings) view.fire(firing.transition, firing.error);
     for (const element of view.elements.values()) if (element.shape === "place") view.tokens(element.name, shown[element.name] ?? 0);
   }
@@ -117,8 +117,8 @@ export class History {
       tool("first", "First record", () => this.go(0)), tool("back", "Previous record", () => this.step(-1)),
       tool("next", "Next record", () => this.step(1)), tool("last", "Last record", () => this.go(Infinity)),
       this.where, h("div", { class: "spacer" }),
-      h("button", { type: "button", class: "small", onclick: () => this.toError(-1) }, icon("back"), "Previous error"),
-      h("button", { type: "button", class: "small", onclick: () => this.toError(1) }, "Next error", icon("next")), this.startHere);
+      h("button", { type: "button", class: "small", "aria-label": "Previous error", onclick: () => this.toError(-1) }, icon("back"), "Error"),
+      h("button", { type: "button", class: "small", "aria-label": "Next error", onclick: () => this.toError(1) }, "Error", icon("next")), this.startHere);
   }
 
   async shown() {
@@ -271,10 +271,10 @@ export class History {
     let current = null;
     fill(this.rowsBox, listed.slice(from, from + 2 * ROWS_AROUND).map(([record, at]) => {
       const row = h("li", {}, h("button", { type: "button", class: `record${record.error ? " error" : ""}${at > this.index ? " future" : ""}`, "aria-current": at === this.index ? "true" : null, onclick: () => this.go(at, false) },
-        h("span", { class: "line" }, h("strong", {}, record.firings.length ? record.firings.map((f) => words(f.transition)).join(", ") : record.text), h("span", { class: "number muted" }, seconds(record.t))),
-        record.firings.length ? h("span", { class: "detail" }, record.text) : null,
+        h("span", { class: "line" }, h("strong", {}, record.firings.length ? record.firings.map((f) => words(f.transition)).join(", ") : words(record.text)), h("span", { class: "number muted" }, seconds(record.t))),
+        record.firings.length ? h("span", { class: "detail" }, words(record.text)) : null,
         record.firings.map(reasonText).filter(Boolean).map((r) => h("span", { class: "detail reason" }, r)),
-        (record.notes ?? []).map((note) => h("span", { class: "detail" }, note))));
+        (record.notes ?? []).map((note) => h("span", { class: "detail" }, words(note)))));
       if (at === this.index) current = row;
       return row;
     }));

@@ -176,7 +176,7 @@ export class Live {
       const why = failed.get(element.name);
       if (element.shape === "transition") this.view.mark(element.name, "reason", why ? "failed" : null, why ? reasonText(why) : "");
     }
-    if (task) this.view.alarm(alarmed(task, marking));
+    if (task) this.view.alarm(alarmed(task, marking, firings.map((f) => f.transition)));
   }
 
   paintFirings() {
@@ -193,7 +193,7 @@ export class Live {
     return h("li", { class: `firing ${what}` },
       h("button", { type: "button", onclick: () => this.canvas.goTo(firing.transition) },
         h("span", { class: "line" }, h("strong", {}, this.labelOf(firing.transition)), h("span", { class: "number" }, seconds(firing.at))),
-        h("span", { class: "cause" }, firing.cause ?? ""),
+        h("span", { class: "cause" }, words(firing.cause ?? "")),
         reason ? h("span", { class: "reason" }, icon(firing.error ? "error" : "warning"), h("span", {}, reason)) : null));
   }
 

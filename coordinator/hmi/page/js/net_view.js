@@ -1,7 +1,7 @@
 // Draws one net as SVG and alters only what changed. Shared by the live view, the designer and the history.
 
 import { attribute, s, text, words } from "./dom.js";
-import { at, BAR_H, BAR_W, bounds, path, pips, PLACE_R, route } from "./geometry.js";
+import { at, BAR_H, BAR_W, bounds, labelAt, labelSide, path, pips, PLACE_R, route } from "./geometry.js";
 import { Flights } from "./flights.js";
 import { iconPath } from "./icons.js";
 
@@ -147,6 +147,28 @@ export class NetView {
       arc.node.remove();
       this.arcs.delete(id);
     }
+    this.label(this.elements.keys());
+  }
+
+  /** Put labels where no arc of their element runs through them. */
+  label(names) {
+    const curves = new Map();
+    for (const arc of this.arcs.values()) {
+      if (this.isFolded(this.elements.get(arc.place)) || this.isFolded(this.elements.get(arc.transition))) continue;
+      for (const name of [arc.place, arc.transition]) curves.has(name) ? curves.get(name).push(arc.curve) : curves.set(name, [arc.curve]);
+    }
+    for (const name of names) {
+      const element = this.elements.get(name);
+      if (!element) continue;
+      const side = labelSide(element, curves.get(name) ?? []);
+      const [x, y, below, anchor] = labelAt(element, side);
+      const { label, sub } = element.parts;
+      attribute(label, "x", x);
+      attribute(label, "y", y);
+      attribute(sub, "x", x);
+      attribute(sub, "y", side === "below" || side === "above" || element.shape === "place" ? below : y - 14);
+      for (const node of [label, sub]) attribute(node, "text-anchor", anchor);
+    }
   }
 
   arc(id, given, place, transition, list, twin) {
@@ -193,6 +215,7 @@ export class NetView {
       if (!all && !names.has(arc.place) && !names.has(arc.transition)) continue;
       this.arc(arc.id, arc, this.elements.get(arc.place), this.elements.get(arc.transition), list, arc.twin);
     }
+    this.label(all ? this.elements.keys() : names);
   }
 
   // ---- folding of error branches ------------------------------------------------------------------------------------

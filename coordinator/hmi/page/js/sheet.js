@@ -60,13 +60,19 @@ export function tokensOf(task, marking) {
   return shown;
 }
 
-/** Places whose folded error branch holds a token now. */
-export function alarmed(task, marking) {
+/** Places whose folded error branch holds a token now; `fired` are the last firings, newest last, and tell which of several. */
+export function alarmed(task, marking, fired = []) {
   const inError = new Set(task.places.filter((p) => p.error).map((p) => p.name));
-  const held = new Set([...inError].filter((name) => marking[name]));
-  if (!held.size) return held;
-  const begins = task.arcs.filter((a) => a.direction === "in" && a.end === "error");
-  return new Set(begins.filter((a) => reaches(task, a.transition, inError, held)).map((a) => a.place));
+  const held = [...inError].filter((name) => marking[name]);
+  const begins = held.length ? task.arcs.filter((a) => a.direction === "in" && a.end === "error" && !inError.has(a.place)) : [];
+  const last = (arc) => fired.lastIndexOf(arc.transition);
+  const alarms = new Set();
+  for (const place of held) {
+    const ways = begins.filter((arc) => reaches(task, arc.transition, inError, place));
+    const newest = Math.max(-1, ...ways.map(last));
+    for (const arc of ways) if (newest < 0 || last(arc) === newest) alarms.add(arc.place);
+  }
+  return alarms;
 }
 
 function reaches(task, first, inError, wanted) {
@@ -76,7 +82,7 @@ function reaches(task, first, inError, wanted) {
     const transition = open.pop();
     for (const arc of task.arcs) {
       if (arc.transition !== transition || arc.direction !== "out" || seen.has(arc.place) || !inError.has(arc.place)) continue;
-      if (wanted.has(arc.place)) return true;
+      if (arc.place === wanted) return true;
       seen.add(arc.place);
       for (const next of task.arcs) if (next.direction === "in" && next.place === arc.place) open.push(next.transition);
     }

@@ -2,9 +2,7 @@
 
 import { h, seconds, text, words } from "./dom.js";
 
-const LANE = 24;
-const LEFT = 150;
-const HEAD = 20;
+let [LANE, LEFT, HEAD] = [24, 150, 20]; // px at the usual type size; all grow with the type of a wall screen
 const STEPS = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1800, 3600];
 
 export class Timeline {
@@ -29,6 +27,8 @@ export class Timeline {
 
   draw() {
     const width = this.root.clientWidth;
+    this.em = parseFloat(getComputedStyle(this.root).fontSize) / 14;
+    [LANE, LEFT, HEAD] = [24 * this.em, 150 * this.em, 20 * this.em];
     if (!this.lanes || !width || !this.root.offsetParent) return;
     const height = HEAD + Math.max(1, this.lanes.length) * LANE + 4;
     const ratio = devicePixelRatio || 1;
@@ -54,28 +54,28 @@ export class Timeline {
   }
 
   axis(pen, from, length, scale, width, height) {
-    pen.font = "11px system-ui, sans-serif";
-    const step = STEPS.find((s) => s * scale >= 64) ?? 7200;
+    pen.font = `${11 * this.em}px system-ui, sans-serif`;
+    const step = STEPS.find((s) => s * scale >= 64 * this.em) ?? 7200;
     for (let t = Math.ceil(from / step) * step; t <= from + length + 1e-9; t += step) {
       const x = LEFT + (t - from) * scale;
       pen.fillStyle = this.colour("line");
       pen.fillRect(Math.round(x), HEAD - 4, 1, height);
       pen.fillStyle = this.colour("muted");
       pen.textAlign = "center";
-      if (x < width - 24) pen.fillText(step < 1 ? t.toFixed(1) : `${Math.round(t)} s`, x, 11);
+      if (x < width - 24) pen.fillText(step < 1 ? t.toFixed(1) : `${Math.round(t)} s`, x, 11 * this.em);
     }
   }
 
   lanesOf(pen, width) {
     pen.textAlign = "left";
-    pen.font = "12px system-ui, sans-serif";
+    pen.font = `${12 * this.em}px system-ui, sans-serif`;
     this.lanes.forEach((lane, i) => {
       const y = HEAD + i * LANE;
       pen.fillStyle = this.colour("line");
       pen.fillRect(0, y + LANE - 1, width, 1);
       pen.fillStyle = this.colour("text");
       const label = words(lane.label || lane.name);
-      pen.fillText(label.length > 21 ? `${label.slice(0, 20)}…` : label, 12, y + 16);
+      pen.fillText(label.length > 21 ? `${label.slice(0, 20)}…` : label, 12, y + 16 * this.em);
     });
   }
 
@@ -87,7 +87,7 @@ export class Timeline {
       const x0 = Math.max(LEFT, LEFT + (run.started - from) * scale);
       const x1 = Math.min(width - 12, LEFT + (end - from) * scale);
       if (i === undefined || x1 < LEFT) return;
-      const bar = { x: x0, y: HEAD + i * LANE + 4, w: Math.max(2, x1 - x0), h: LANE - 9, run, end };
+      const bar = { x: x0, y: HEAD + i * LANE + 4, w: Math.max(2, x1 - x0), h: LANE - 9 * this.em, run, end };
       pen.fillStyle = this.colour(colour);
       pen.beginPath();
       pen.roundRect(bar.x, bar.y, bar.w, bar.h, 3);
@@ -102,14 +102,14 @@ export class Timeline {
   }
 
   barLabel(pen, bar) {
-    if (bar.w < 70) return;
+    if (bar.w < 70 * this.em) return;
     pen.save();
     pen.beginPath();
     pen.rect(bar.x, bar.y, bar.w - 6, bar.h);
     pen.clip();
     pen.fillStyle = this.colour("on-colour");
-    pen.font = "11px system-ui, sans-serif";
-    pen.fillText(words(bar.run.action), bar.x + 6, bar.y + 11.5);
+    pen.font = `${11 * this.em}px system-ui, sans-serif`;
+    pen.fillText(words(bar.run.action), bar.x + 6, bar.y + 11.5 * this.em);
     pen.restore();
   }
 

@@ -11,6 +11,8 @@ document.body.append(place);
 export function toast(level, message) {
   const [sign, duration] = LEVELS[level] ?? LEVELS.info;
   const node = h("div", { class: `toast ${level}` }, icon(sign), h("span", {}, message), h("button", { type: "button", class: "tool", "aria-label": "Dismiss", onclick: () => node.remove() }, icon("close")));
+  if ([...place.children].some((other) => other.title === message)) return; // said already
+  node.title = message;
   if (level === "ok") place.querySelector(".toast.ok")?.remove(); // the newest confirmation is enough
   place.append(node);
   while (place.children.length > 4) place.firstChild.remove();

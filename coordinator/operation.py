@@ -1,0 +1,253 @@
+"""The operator's side of a live mission run: what clients see, and their commands turned into stimuli.
+
+Implements `coordinator.hmi.port.MissionPort` over a mission run in real time. Every command is a journaled stimulus; who holds
+the controls is settled here. The emergency stop waits for nobody: it goes straight to the nodes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable, Mapping
+from typing import Any
+
+from coordinator.engine import (
+    Abort,
+    AddTokens,
+    ForceExit,
+    Instruction,
+    Pause,
+    RaiseEvent,
+    RemoveTokens,
+    Report,
+    Resume,
+    SetBreakpoints,
+    State,
+    Step,
+    Stimulus,
+)
+from coordinator.executor import FirstAlternative
+from coordinator.hmi.feed import Feed
+from coordinator.hmi.narrator import Narrator
+from coordinator.mission import Stage
+from coordinator.realtime import RealtimeMission
+from services.comm.messages import Command
+from services.comm.notice import Progress
+
+FREE = frozenset({"estop", "take_controls", "ask_controls", "release_controls"})
+POLL = 0.5
+"""Seconds between questions to the nodes how their devices are, while somebody watches."""
+ANSWERS = 1.5
+"""Seconds that nodes have to answer a pause."""
+REFUSED = frozenset({"refused"})
+
+Answer = dict[str, Any]
+
+
+class Operation:
+    """One mission run as its operators see it; `name` shows in the snapshot."""
+
+    def __init__(self, shell: RealtimeMission, selector: FirstAlternative) -> None:
+        self.shell = shell
+        self.mission = shell.mission
+        self.executor = shell.mission.executor
+        self.feed = Feed()
+        self._selector = selector
+        self._holder: str | None = None
+        self._asking: list[str] = []
+        self._refusals: list[str] = []
+        self._clients = 0
+        self._numbers = 0
+        loop = asyncio.get_running_loop()
+        where = {name: entry.node for name, entry in self.executor.directory.actions.items()}
+        self.narrator = Narrator(self.feed, self.executor.task, where, loop.time())
+        self.narrator.begin(self.executor.mission, "realtime", controls=self._controls(), selectors=self._selectors())
+        self.executor.observers.extend([self.narrator, self])
+        self._polling = loop.create_task(self._poll())
+
+    async def close(self) -> None:
+        """Ask the nodes no more."""
+        self._polling.cancel()
+        await asyncio.gather(self._polling, return_exceptions=True)
+
+    # --- an observer of the executor -------------------------------------------------------------------------------
+
+    def instruction(self, now: float, instruction: Instruction) -> None:
+        """Keep what the engine refuses, for the answer to the command."""
+        if isinstance(instruction, Report) and instruction.key in REFUSED:
+            self._refusals.append(instruction.text)
+
+    def stimulus(self, now: float, stimulus: Stimulus) -> None:
+        """Nothing to keep."""
+
+    def progress(self, now: float, run: str, notice: Progress) -> None:
+        """Nothing to keep."""
+
+    def settled(self, now: float, state: State) -> None:
+        """Nothing to keep."""
+
+    # --- the port --------------------------------------------------------------------------------------------------
+
+    def snapshot(self) -> dict[str, Any]:
+        """The state now."""
+        return self.feed.snapshot()
+
+    def subscribe(self, receive: Callable[[dict[str, Any]], None]) -> Callable[[], None]:
+        """Give every later change to `receive`."""
+        self._clients += 1
+        stop = self.feed.subscribe(receive)
+
+        def leave() -> None:
+            self._clients -= 1
+            stop()
+
+        return leave
+
+    async def command(self, who: str, verb: str, data: Mapping[str, Any]) -> Answer:
+        """Carry out a command; answers after it is journaled."""
+        if verb not in FREE and self._holder != who:
+            return _no("not_holder", f"{self._holder or 'nobody'} holds the controls; take or ask for them first")
+        carry_out: Callable[[str, Mapping[str, Any]], Awaitable[Answer]] | None = getattr(self, f"_do_{verb}", None)
+        if carry_out is None:
+            return _no("unknown", f"no command {verb!r} for a mission run that goes on")
+        try:
+            return await carry_out(who, data)
+        except (KeyError, TypeError, ValueError) as fault:
+            return _no("bad_data", f"{verb}: {fault}")
+
+    # --- who holds the controls --------------------------------------------------------------------------------------
+
+    async def _do_take_controls(self, who: str, data: Mapping[str, Any]) -> Answer:
+        if self._holder not in (None, who):
+            return _no("held", f"{self._holder} holds the controls; ask for them")
+        return self._hand_over(who)
+
+    async def _do_ask_controls(self, who: str, data: Mapping[str, Any]) -> Answer:
+        if who != self._holder and who not in self._asking:
+            self._asking.append(who)
+        return self._hand_over(self._holder)
+
+    async def _do_release_controls(self, who: str, data: Mapping[str, Any]) -> Answer:
+        if who == self._holder:
+            wanted = data.get("to")
+            return self._hand_over(wanted if wanted in self._asking else None)
+        return {"ok": True}
+
+    def _hand_over(self, holder: str | None) -> Answer:
+        self._holder = holder
+        self._asking = [name for name in self._asking if name != holder]
+        self.feed.emit("controls", controls=self._controls())
+        return {"ok": True}
+
+    def _controls(self) -> dict[str, Any]:
+        return {"holder": self._holder, "asking": list(self._asking)}
+
+    # --- commands that are stimuli -----------------------------------------------------------------------------------
+
+    async def _do_pause(self, who: str, data: Mapping[str, Any]) -> Answer:
+        answer = self._order(Pause(f"by {who}"))
+        await self._until(
+            lambda: not any(run["state"] == "holding" for run in self.feed.state["runs"].values()), ANSWERS
+        )
+        return {**answer, "nodes": dict((self.feed.state["paused"] or {}).get("nodes", {}))}
+
+    async def _do_resume(self, who: str, data: Mapping[str, Any]) -> Answer:
+        return self._order(Resume())
+
+    async def _do_step(self, who: str, data: Mapping[str, Any]) -> Answer:
+        return self._order(Step())
+
+    async def _do_abort(self, who: str, data: Mapping[str, Any]) -> Answer:
+        return self._order(Abort(f"by {who}"))
+
+    async def _do_breakpoint(self, who: str, data: Mapping[str, Any]) -> Answer:
+        name = str(data["element"]).partition(".")[2]
+        names = set(self.executor.state.breakpoints)
+        (names.add if data.get("on", True) else names.discard)(name)
+        return self._order(SetBreakpoints(tuple(sorted(names))))
+
+    async def _do_add_tokens(self, who: str, data: Mapping[str, Any]) -> Answer:
+        return self._order(AddTokens(str(data["place"]), int(data.get("count", 1))))
+
+    async def _do_remove_tokens(self, who: str, data: Mapping[str, Any]) -> Answer:
+        return self._order(RemoveTokens(str(data["place"]), int(data.get("count", 1))))
+
+    async def _do_raise_event(self, who: str, data: Mapping[str, Any]) -> Answer:
+        return self._order(RaiseEvent(str(data["event"])))
+
+    async def _do_force_exit(self, who: str, data: Mapping[str, Any]) -> Answer:
+        return self._order(ForceExit(str(data["transition"])))
+
+    async def _do_override_selector(self, who: str, data: Mapping[str, Any]) -> Answer:
+        task, action = str(data["primitive_task"]), data.get("action")
+        primitive = self.executor.task.primitive_tasks[task]
+        if action is not None and action not in primitive.alternatives:
+            return _no("refused", f"{action} is no alternative of {task}: {', '.join(primitive.alternatives)}")
+        self._selector.override(task, action)
+        selector = {**self.feed.state["selectors"].get(task, {}), "override": action}
+        self.feed.emit("selector", name=task, selector=selector)
+        return {"ok": True}
+
+    def _selectors(self) -> dict[str, Any]:
+        tasks = self.executor.task.primitive_tasks
+        return {
+            n: {"alternatives": [{"action": a} for a in p.alternatives], "override": None} for n, p in tasks.items()
+        }
+
+    def _order(self, stimulus: Stimulus) -> Answer:
+        if self.mission.stage is not Stage.RUNNING:
+            return _no("idle", f"the mission run is {self.mission.stage.value}")
+        self._refusals.clear()
+        self.executor.stimulate(asyncio.get_running_loop().time(), stimulus)
+        self.executor.store.sync()
+        self.shell.settle()
+        return _no("refused", self._refusals[0]) if self._refusals else {"ok": True}
+
+    # --- straight to the nodes ---------------------------------------------------------------------------------------
+
+    async def _do_estop(self, who: str, data: Mapping[str, Any]) -> Answer:
+        for node in self.mission.callers:
+            self._ask_node(node, "stop")
+        answer = self._order(Abort(f"emergency stop by {who}"))
+        self.feed.emit("mission", mission={"state": "stopped", "reason": f"emergency stop by {who}"})
+        return answer if answer["ok"] or answer["code"] != "idle" else {"ok": True}
+
+    def _ask_node(self, node: str, verb: str) -> None:
+        self._numbers += 1
+        now = asyncio.get_running_loop().time()
+        self.mission.callers[node].command(
+            now, Command(f"{self.executor.mission}/operator/{verb}#{self._numbers}", verb)
+        )
+        self.shell.clients[node].flush(now)
+
+    async def _poll(self) -> None:
+        """Keep health of nodes and state of devices fresh while somebody watches."""
+        self.executor.on_status = self._status
+        while True:
+            for node, caller in self.mission.callers.items():
+                state = "up" if caller.up else "lost" if node in self.mission.lost else "connecting"
+                entry = {"state": state, "text": self.mission.lost.get(node, "")}
+                if self.feed.state["nodes"].get(node) != entry:
+                    self.feed.emit("node", name=node, node=entry)
+                if self._clients and caller.up:
+                    self._ask_node(node, "status")
+            await asyncio.sleep(POLL)
+
+    def _status(self, data: Mapping[str, Any]) -> None:
+        for name, about in dict(data.get("devices", {})).items():
+            state = dict(about.get("state", {})) if isinstance(about, Mapping) else {}
+            if name not in self.executor.directory.devices or not state:
+                continue
+            values = {k: v for k, v in state.items() if isinstance(v, bool | int | float | str)}
+            device: dict[str, Any] = {"state": str(state.get("mode", "up")), "values": values}
+            if isinstance(state.get("q"), list | tuple):
+                device["joints"] = [float(angle) for angle in state["q"]]
+            self.feed.emit("device", name=name, device=device)
+
+    async def _until(self, ready: Callable[[], bool], timeout: float) -> None:
+        deadline = asyncio.get_running_loop().time() + timeout
+        while not ready() and asyncio.get_running_loop().time() < deadline:
+            await asyncio.sleep(0.02)
+
+
+def _no(code: str, text: str) -> Answer:
+    return {"ok": False, "code": code, "text": text}
