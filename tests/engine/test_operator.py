@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from coordinator.engine import (
+    ORDERS,
     Abort,
     AddTokens,
     ArmTimer,
@@ -30,11 +31,13 @@ from coordinator.engine import (
     RunHeld,
     RunRecorded,
     SetBreakpoints,
+    StartRun,
     Step,
     StopConfirmed,
     TimerFired,
+    VariableChanged,
 )
-from coordinator.task import Status
+from coordinator.task import Reference, Status
 
 Plays = Callable[..., Any]
 OK, ERR = Status.SUCCESS, Status.ERROR
@@ -235,3 +238,51 @@ def test_operators_token_is_no_way_to_lose_the_end(play: Plays) -> None:
     assert not p.finished
     p(RemoveTokens("x"))
     assert p.finished.status is OK
+
+
+def test_outstanding_orders_are_those_that_nobody_has_answered(play: Plays) -> None:
+    net = {
+        "t": {"in": "a:preempt=none", "event": "e"},
+        "late": {"in": "x", "after": 5.0},
+        "n": {"in": "b:normal"},
+    }
+    p = play(
+        "a!=1 b!=1 c!=1 x=1",
+        net,
+        "e",
+        alternatives={"c": ("one", "two")},
+        args={"b": {"v": Reference("k")}},
+        variables={"k": 4},
+    )
+    begun = [i for i in p.all if isinstance(i, ORDERS)]
+    assert sorted(map(repr, p.engine.outstanding(p.state))) == sorted(map(repr, begun))
+    (_, cancel) = p(EventOccurred("e"))
+    p(VariableChanged("k", 5), RunEnded("b#1", OK), Pause())
+    left = p.engine.outstanding(p.state)
+    kinds = sorted(type(i).__name__ for i in left)
+    assert kinds == ["ArmTimer", "CancelRun", "Choose", "HoldTimer"] and cancel in left
+    p(StopConfirmed("a#1"), Resume(), TimerFired(p.of(ArmTimer)[0].key), Chosen("c#1", "two"))
+    (start,) = p.engine.outstanding(p.state)
+    assert start == p.of(StartRun)[-1] and start.action == "two"
+
+
+def test_outstanding_start_keeps_the_arguments_that_it_had(play: Plays) -> None:
+    p = play("b!=1", {"n": {"in": "b:normal"}}, args={"b": {"v": Reference("k")}}, variables={"k": 4})
+    p(VariableChanged("k", 5), Pause(), RunHeld("b#1", Hold.HELD))
+    assert p.engine.outstanding(p.state) == (p.of(StartRun)[0], HoldRun("b#1")) and p.of(StartRun)[0].arguments == {
+        "v": 4
+    }
+
+
+def test_outstanding_draw(play: Plays) -> None:
+    net = {n: {"in": "x", "weight": 1.0, "event": "e"} for n in ("t", "u")}
+    p = play("x=1", net, "e")
+    (choose,) = p(EventOccurred("e"))
+    assert p.engine.outstanding(p.state) == (choose,)
+
+
+def test_only_awaited_events_are_worth_a_stimulus(play: Plays) -> None:
+    p = play("x=1 a! b! y", LINE, "e f")
+    assert p.engine.awaits(p.state, "e") and not p.engine.awaits(p.state, "f")
+    p(EventOccurred("e"))
+    assert not p.engine.awaits(p.state, "e")
