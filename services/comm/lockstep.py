@@ -239,8 +239,8 @@ class Member:
                 return TickLink(hello.name, sock, connection)
             sock.sendall(connection.send(refusal or Refuse("malformed", "no HELLO")))
         except ProtocolError as fault:
-            with contextlib.suppress(OSError, ProtocolError):
-                sock.sendall(connection.send(Refuse(fault.code, fault.text)))
+            with contextlib.suppress(OSError):
+                sock.sendall(connection.refusal(Refuse(fault.code, fault.text[:500])))
         except OSError:
             pass
         sock.close()

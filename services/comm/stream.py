@@ -2,8 +2,8 @@
 
 The sender opens with the handshake of the node protocol (role "stream"), then STREAM_OPEN, then one SET_POINT a period for
 as long as it stands by its values, and WITHDRAW when it does no more. Nothing here waits: a value that finds no room is
-dropped, since a newer one follows; the receiver drains its sockets to the newest value. Pacing is the sender's loop's and
-the watchdog on the age is the sink's; what a delay on the way has made too old never gets that far.
+dropped, since a newer one follows; the receiver drains its sockets to the newest value, and withdraws it once it is older
+than three periods, what it lost on its way included. Pacing is the sender's loop's.
 """
 
 from __future__ import annotations
@@ -258,7 +258,7 @@ class StreamReceiver:
             self._end(guest)
             return
         rest = self._open(guest, messages) if guest.inlet is None else messages
-        if guest.inlet is not None and rest:
+        if guest.inlet is not None:
             guest.inlet.receive(now, rest)
             if any(isinstance(message, Bye) for message in rest):
                 self._end(guest)

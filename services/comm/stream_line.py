@@ -30,7 +30,7 @@ class Sink(Protocol):
         """A set point has arrived, `held` seconds after its sender first sent these values."""
 
     def withdraw(self) -> None:
-        """The sender stands by it no more, or is gone."""
+        """It counts no more: its sender does not stand by it, is gone, or it has become too old."""
 
 
 class Lateness:
@@ -52,20 +52,18 @@ class Lateness:
 
 
 class Inlet:
-    """Receiving end of one open stream, without socket or clock: what has been delayed too long is left out."""
+    """Receiving end of one open stream, without socket or clock: what is older than three periods does not count.
 
-    __slots__ = ("_late", "_lateness", "_limit", "_sink")
+    What a set point lost on its way counts as age, so one that was held up is not taken for a fresh one.
+    """
+
+    __slots__ = ("_lateness", "_limit", "_sink", "_until")
 
     def __init__(self, period: float, sink: Sink) -> None:
         self._limit = STALE_AFTER * period
         self._sink = sink
         self._lateness = Lateness()
-        self._late = 0
-
-    @property
-    def late(self) -> int:
-        """How many came more than three periods late and were left out."""
-        return self._late
+        self._until = math.inf
 
     def receive(self, now: float, messages: Sequence[Message]) -> None:
         """Take what has arrived by `now`: the newest counts, the others only show how late things are."""
@@ -76,13 +74,12 @@ class Inlet:
                 newest, late = message, self._lateness.of(now, message.elapsed)
             elif isinstance(message, Withdraw):
                 newest = message
-        if isinstance(newest, Withdraw):
+        if isinstance(newest, SetPoint) and late <= self._limit:
+            self._until = now - late + self._limit
+            self._sink.take(newest.values, newest.held + late)
+        elif isinstance(newest, Withdraw) or now > self._until:
+            self._until = math.inf
             self._sink.withdraw()
-        elif isinstance(newest, SetPoint):
-            if late > self._limit:
-                self._late += 1
-            else:
-                self._sink.take(newest.values, newest.held + late)
 
 
 @dataclass(frozen=True, slots=True)

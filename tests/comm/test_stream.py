@@ -1,0 +1,246 @@
+"""Set-point streams: newest value wins, lateness, refusals, and ends."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable, Iterator, Sequence
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.comm import messages as m
+from services.comm.codec import encode
+from services.comm.security import KeyNeededError
+from services.comm.stream import Incoming, Inlet, StreamReceiver, StreamSender
+from services.comm.stream_line import Lateness
+
+
+class Sink:
+    """Writes down what it is given; None for a withdrawal."""
+
+    def __init__(self) -> None:
+        self.got: list[tuple[tuple[float, ...], float] | None] = []
+
+    def take(self, values: Sequence[float], held: float = 0.0) -> None:
+        self.got.append((tuple(values), held))
+
+    def withdraw(self) -> None:
+        self.got.append(None)
+
+
+def _point(number: int, elapsed: float = 0.0, held: float = 0.0) -> m.SetPoint:
+    return m.SetPoint(number, (float(number),), held, elapsed)
+
+
+def test_the_newest_wins_and_the_others_are_never_seen() -> None:
+    sink = Sink()
+    inlet = Inlet(0.1, sink)
+    inlet.receive(1.0, [_point(1), _point(2), _point(3, held=0.04)])
+    inlet.receive(1.1, [])
+    inlet.receive(1.2, [_point(4), m.Withdraw()])
+    inlet.receive(1.3, [m.Withdraw(), _point(5, elapsed=0.3)])
+    assert sink.got == [((3.0,), 0.04), None, ((5.0,), 0.0)]
+
+
+def test_what_was_held_up_on_its_way_is_as_old_as_it_is() -> None:
+    sink = Sink()
+    inlet = Inlet(0.04, sink)
+    for n in range(5):
+        inlet.receive(100.0 + n * 0.04, [_point(n, elapsed=n * 0.04)])
+    assert [one and one[0] for one in sink.got] == [(float(n),) for n in range(5)]
+    inlet.receive(100.279, [])
+    assert sink.got[-1] is not None
+    inlet.receive(100.281, [])
+    inlet.receive(100.3, [])
+    assert sink.got[5:] == [None], "three periods and it counts no more, said once"
+    inlet.receive(100.7, [_point(5, elapsed=0.20)])
+    assert sink.got[5:] == [None], "half a second late: left out"
+    inlet.receive(100.7, [_point(6, elapsed=0.60)])
+    newest = sink.got[6]
+    assert newest is not None and newest[0] == (6.0,)
+    assert newest[1] == pytest.approx(0.1, abs=1e-3), "its delay is part of its age"
+    inlet.receive(100.719, [])
+    assert len(sink.got) == 7
+    inlet.receive(100.721, [])
+    assert sink.got[7:] == [None]
+
+
+@given(st.lists(st.tuples(st.floats(0.001, 0.1), st.floats(0.0, 0.5)), min_size=1, max_size=50), st.floats(-1e3, 1e3))
+def test_lateness_is_the_delay_beyond_the_quickest(steps: list[tuple[float, float]], offset: float) -> None:
+    lateness, elapsed, quickest, arrived = Lateness(), 0.0, float("inf"), float("-inf")
+    for step, delay in steps:
+        elapsed += step
+        arrived = max(arrived, elapsed + delay)
+        quickest = min(quickest, arrived - elapsed)
+        late = lateness.of(arrived + offset, elapsed)
+        assert 0.0 <= late <= arrived - elapsed - quickest + 1e-9
+        assert late >= arrived - elapsed - quickest - 1e-4 * 10.0
+
+
+def test_a_drifting_clock_does_not_make_an_hour_old_stream_late() -> None:
+    lateness = Lateness()
+    assert max(lateness.of(t * 0.04 * (1.0 + 5e-5), t * 0.04) for t in range(90_000)) < 1e-5
+
+
+# On sockets.
+
+
+@pytest.fixture
+def sink() -> Sink:
+    return Sink()
+
+
+@pytest.fixture
+def receiver(sink: Sink, key: bytes | None) -> Iterator[StreamReceiver]:
+    one = StreamReceiver("motion", {"catch_point": Incoming(0.04, sink, "t1")}, key=key)
+    yield one
+    one.close()
+
+
+@pytest.fixture
+def sender(receiver: StreamReceiver, key: bytes | None) -> Iterator[StreamSender]:
+    one = StreamSender("vision", "catch_point", 0.04, *receiver.address, ticket="t1", key=key)
+    yield one
+    one.close()
+
+
+def _until(condition: Callable[[], bool], *steps: Callable[[], object]) -> None:
+    end = time.monotonic() + 5.0
+    while not condition():
+        assert time.monotonic() < end, "it did not come to pass"
+        for step in steps:
+            step()
+
+
+def test_a_stream_from_its_first_value_to_its_end(sink: Sink, receiver: StreamReceiver, sender: StreamSender) -> None:
+    assert not sender.send((0.0,)), "not connected yet: dropped, a newer one follows"
+    _until(lambda: sender.up, sender.advance, receiver.poll)
+    assert sender.send((1.0, 2.0), held=0.08) and sender.send((3.0, 4.0))
+    _until(lambda: bool(sink.got), receiver.poll)
+    _until(lambda: sink.got[-1] is not None and sink.got[-1][0] == (3.0, 4.0), receiver.poll)
+    sender.withdraw()
+    _until(lambda: sink.got[-1] is None, receiver.poll)
+    assert sender.send((5.0,))
+    _until(lambda: sink.got[-1] is not None, receiver.poll)
+    sender.close()
+    _until(lambda: sink.got[-1] is None, receiver.poll)
+    assert len(receiver.sockets()) == 1 and receiver.faults == 0
+
+
+def test_a_sender_that_is_gone_stands_by_nothing(sink: Sink, receiver: StreamReceiver, sender: StreamSender) -> None:
+    _until(lambda: bool(sink.got), lambda: sender.send((1.0,)), receiver.poll)
+    assert sender._line is not None
+    sender._line.sock.close()
+    _until(lambda: sink.got[-1] is None, receiver.poll)
+
+
+def test_a_receiver_that_comes_back_is_found_again(
+    sink: Sink, receiver: StreamReceiver, sender: StreamSender, key: bytes | None
+) -> None:
+    _until(lambda: bool(sink.got), lambda: sender.send((1.0,)), receiver.poll)
+    host, port = receiver.address
+    receiver.close()
+    _until(lambda: not sender.up, lambda: sender.send((2.0,)))
+    again = StreamReceiver("motion", {"catch_point": Incoming(0.04, sink, "t1")}, host=host, port=port, key=key)
+    _until(lambda: sink.got[-1] is not None, lambda: sender.send((3.0,)), again.poll)
+    again.close()
+
+
+def test_the_newest_sender_of_a_stream_takes_it_over(
+    sink: Sink, receiver: StreamReceiver, sender: StreamSender, key: bytes | None
+) -> None:
+    _until(lambda: bool(sink.got), lambda: sender.send((1.0,)), receiver.poll)
+    other = StreamSender("vision2", "catch_point", 0.04, *receiver.address, ticket="t1", key=key)
+    _until(lambda: sink.got[-1] is not None and sink.got[-1][0] == (2.0,), lambda: other.send((2.0,)), receiver.poll)
+    assert len(receiver.sockets()) == 2
+    other.close()
+
+
+@pytest.mark.parametrize(
+    ("stream", "period", "ticket", "code"),
+    [
+        ("other", 0.04, "t1", "unknown_stream"),
+        ("catch_point", 0.1, "t1", "period"),
+        ("catch_point", 0.04, "t2", "ticket"),
+        ("catch_point", 0.04, "", "ticket"),
+    ],
+)
+def test_a_stream_that_does_not_fit_is_refused_with_the_reason(
+    sink: Sink, receiver: StreamReceiver, key: bytes | None, stream: str, period: float, ticket: str, code: str
+) -> None:
+    sender = StreamSender("vision", stream, period, *receiver.address, ticket=ticket, key=key)
+    _until(lambda: bool(sender.refusal), lambda: sender.send((1.0,)), receiver.poll)
+    assert sender.refusal.startswith(code) and not sender.up
+    assert receiver.faults >= 1 and sink.got == []
+    sender.close()
+
+
+@pytest.mark.parametrize("key", [b"k" * 32], indirect=True, ids=["sealed"])
+def test_a_sender_without_the_key_is_refused(sink: Sink, receiver: StreamReceiver) -> None:
+    for wrong in (None, b"x" * 32):
+        sender = StreamSender("vision", "catch_point", 0.04, *receiver.address, ticket="t1", key=wrong)
+        _until(lambda one=sender: bool(one.refusal), lambda one=sender: one.send((1.0,)), receiver.poll)  # type: ignore[misc]
+        assert "key" in sender.refusal
+        sender.close()
+    assert sink.got == []
+
+
+def _frame(message: m.Message) -> bytes:
+    body = encode(message)
+    return len(body).to_bytes(4, "big") + body
+
+
+OPENING = _frame(m.Hello(1, 1, "stream", "vision", "b")) + b""
+MALFORMED = [
+    pytest.param([b"\x00\x00\x00\x05hello"], id="random bytes"),
+    pytest.param([OPENING, _frame(m.SetPoint(1, (1.0,)))], id="no STREAM_OPEN"),
+    pytest.param([OPENING, _frame(m.StreamOpen("catch_point", 0.04, "t1")), b"\xff" * 9], id="bad set point"),
+    pytest.param([OPENING, bytes.fromhex("00 00 00 0c 93 16 01 91 cb 7f f8 00 00 00 00 00 00")], id="nan"),
+]
+
+
+@pytest.mark.parametrize("key", [None], indirect=True, ids=["plain"])
+@pytest.mark.parametrize("said", MALFORMED)
+def test_malformed_set_points_end_their_connection_alone(
+    sink: Sink, receiver: StreamReceiver, sender: StreamSender, said: list[bytes]
+) -> None:
+    with socket.create_connection(receiver.address) as sock:
+        for data in said:
+            sock.sendall(data)
+            _until(lambda: receiver.faults > 0 or _is_served(receiver), receiver.poll)
+        _until(lambda: receiver.faults == 1 and len(receiver.sockets()) == 1, receiver.poll)
+    _until(lambda: bool(sink.got) and sink.got[-1] is not None, lambda: sender.send((1.0,)), receiver.poll)
+
+
+def _is_served(receiver: StreamReceiver) -> bool:
+    return any(guest.line.connection.version for guest in receiver._guests)
+
+
+@pytest.mark.parametrize("key", [None], indirect=True, ids=["plain"])
+def test_many_idle_connections_do_not_keep_a_sender_out(
+    sink: Sink, receiver: StreamReceiver, sender: StreamSender
+) -> None:
+    idle = [socket.create_connection(receiver.address) for _ in range(40)]
+    _until(lambda: bool(sink.got), lambda: sender.send((1.0,)), receiver.poll)
+    assert len(receiver.sockets()) <= 17
+    for one in idle:
+        one.close()
+
+
+@pytest.mark.parametrize("key", [None], indirect=True, ids=["plain"])
+def test_a_receiver_that_stands_still_never_blocks_its_sender_and_sees_the_newest_after(
+    sink: Sink, receiver: StreamReceiver, sender: StreamSender
+) -> None:
+    _until(lambda: bool(sink.got), lambda: sender.send((1.0,)), receiver.poll)
+    for n in range(20_000):
+        sender.send((float(n),))
+    assert sender.dropped > 0
+    _until(lambda: sink.got[-1] is not None and sink.got[-1][0] == (-1.0,), receiver.poll, lambda: sender.send((-1.0,)))
+    assert len(sink.got) < 5_000
+
+
+def test_other_hosts_cannot_send_without_a_key() -> None:
+    with pytest.raises(KeyNeededError):
+        StreamReceiver("motion", {}, host="0.0.0.0")
