@@ -35,6 +35,8 @@ from services.motion.trajectory import Trajectory, synchronised
 
 PERIOD: Final = 0.004
 """s, the servo's and the bus's cycle."""
+LOOK: Final = 3
+"""Cycles on a way round before the straight way is looked at again."""
 LEASE: Final = 0.5
 """s after which following ends in a hold if the action that asked for it has gone silent."""
 SPEED_SHARE: Final = 0.97
@@ -110,6 +112,8 @@ class Arm:
         self._mode = "off"
         self._reason = ""
         self._refused = ""
+        self._share = 1.0
+        self._via: tuple[float, ...] | None = None
         self._paused = False
         self._leased_until = 0.0
         self._after_stop = ""
@@ -117,6 +121,7 @@ class Arm:
         self._measured = [0.0] * JOINTS
         self._measured_speed = [0.0] * JOINTS
         self._cycles = 0
+        self._drive_speeds = self._master.speeds
         self._commands: dict[str, Callable[[float, Mapping[str, Any]], None]] = {
             "move": self._move,
             "follow": self._follow,
@@ -215,14 +220,9 @@ class Arm:
         why = self._guard.violation(target)
         if why:
             raise ValueError(f"pose refused: {why}")
-        speed, acceleration = self._speeds(share), self._full_acceleration
-        if self._trajectory.still:
-            error = np.asarray(target) - np.asarray(self._trajectory.q)
-            limits = synchronised(error, np.asarray(speed), np.asarray(acceleration) * share)
-            speed, acceleration = limits[0].tolist(), limits[1].tolist()
-        self._trajectory.limit(speed, acceleration)
+        self._mode, self._reason, self._via, self._share = "move", "", None, share
+        self._steer(target)
         self._trajectory.aim(target)
-        self._mode, self._reason = "move", ""
 
     def _follow(self, now: float, body: Mapping[str, Any]) -> None:
         self._ready("follow")
@@ -231,6 +231,7 @@ class Arm:
             self._trajectory.limit(self._speeds(), self._full_acceleration)
             self._follower.begin(self._setpoint.count)
             self._ball.arm()
+            self._via = None
         self._follower.strategy = strategy
         self._leased_until = now + LEASE
         self._mode, self._reason = "follow", self._reason if self._mode == "follow" else ""
@@ -260,8 +261,16 @@ class Arm:
     # The cycle.
     def _speeds(self, share: float = 1.0) -> list[float]:
         """Joint speeds to command: the settings' or the drives' own, whichever is less (rad/s)."""
-        drives = [SPEED_SHARE * drive.max_speed or math.inf for drive in self._master.drives]
+        drives = [SPEED_SHARE * speed or math.inf for speed in self._master.speeds]
         return [share * min(mine, theirs) for mine, theirs in zip(self._full_speed, drives, strict=True)]
+
+    def _change_speeds(self) -> None:
+        """The drives go faster or slower than they did: at once while following, else no faster than they can."""
+        self._drive_speeds = self._master.speeds
+        speeds = self._speeds()
+        if self._mode == "move":
+            speeds = [min(pair) for pair in zip(speeds, self._trajectory.speed, strict=True)]
+        self._trajectory.limit(speeds, self._trajectory.acceleration)
 
     def _measure(self) -> None:
         before, self._measured = self._measured, self._master.positions
@@ -285,7 +294,10 @@ class Arm:
         if not enabled:
             self._off("fault" if self._master.troubles else "disabled")
             return
-        if not (self._trajectory.still and self._standing()) and self._lag() > LOST:
+        if self._master.speeds != self._drive_speeds:
+            self._change_speeds()
+        moves = not (self._trajectory.still and self._standing())
+        if moves and not self._master.limited and self._lag() > LOST:
             self._master.give_up(f"the joints are more than {LOST} rad off the commanded path")
             return
         if self._mode == "follow":
@@ -302,9 +314,50 @@ class Arm:
         elif trajectory.target is None or trajectory.arrived(0.0):
             trajectory.accept(*trajectory.proposed())
         else:
-            self._refused = self._guard.advance(trajectory)
+            self._go_on()
             if self._mode == "follow":
                 self._follower.executed(self._ports.now)
+
+    def _go_on(self) -> None:
+        """One cycle towards the target, by way of another pose where the straight way is not clear."""
+        trajectory, target = self._trajectory, self._trajectory.target
+        assert target is not None
+        if self._via is not None and self._cycles % LOOK == 0:
+            rest = trajectory.resting(trajectory.q, trajectory.qd)
+            if self._guard.path_clear(rest, target):
+                self._go_by(None, target)
+            elif trajectory.still:
+                self._go_by(self._way_round(target), target)
+        trajectory.aim(target if self._via is None else self._via)
+        refused = self._guard.advance(trajectory)
+        trajectory.aim(target)
+        if refused and self._via is None:
+            self._go_by(self._way_round(target), target)
+        self._refused = refused
+
+    def _go_by(self, via: tuple[float, ...] | None, target: Sequence[float]) -> None:
+        """Go by way of a pose, or straight: synchronised, so that the way is straight, but in haste while following."""
+        self._via = via
+        if via is None and self._mode == "follow":
+            self._trajectory.limit(self._speeds(), self._full_acceleration)
+        else:
+            self._steer(target if via is None else via)
+
+    def _steer(self, goal: Sequence[float]) -> None:
+        """Limits under which all joints come to a pose together; from motion only nearly so."""
+        trajectory = self._trajectory
+        error = np.subtract(goal, trajectory.resting(trajectory.q, trajectory.qd))
+        share = self._share if self._mode == "move" else 1.0
+        speed, acceleration = synchronised(error, np.array(self._speeds(share)), self.model.acceleration * share)
+        trajectory.limit(speed.tolist(), acceleration.tolist())
+
+    def _way_round(self, target: Sequence[float]) -> tuple[float, ...]:
+        """Where to go first when the straight way is not clear: to before the target, back from the table, or home."""
+        rest = self._trajectory.resting(self._trajectory.q, self._trajectory.qd)
+        for via in (self._interceptor.retreat(target), self._interceptor.retreat(rest)):
+            if via is not None and self._guard.path_clear(rest, via):
+                return via
+        return self.model.poses["home"]
 
     def _follow_on(self, now: float) -> None:
         """Aim at the newest prediction, or hold where it is stale or the action silent."""
@@ -321,8 +374,11 @@ class Arm:
             return
         plan = follower.plan_with(self._interceptor, trajectory, now)
         self._reason = "" if plan is not None else "unreachable"
-        if plan is not None:
-            trajectory.aim(plan.q)
+        if plan is None:
+            return
+        rest = trajectory.resting(trajectory.q, trajectory.qd)
+        trajectory.aim(plan.q)
+        self._go_by(None if self._guard.path_clear(rest, plan.q) else self._way_round(plan.q), plan.q)
 
     def _rest(self, reason: str) -> None:
         """Come to rest and stay there."""

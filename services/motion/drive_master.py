@@ -46,6 +46,10 @@ RESET_CYCLES: Final = 10
 """Cycles between two fault resets."""
 STOP_CYCLES: Final = 125
 """Cycles that a drive is given to stop quickly and stand, before its power is taken away and its brake holds."""
+SPEED_POLL: Final = 1.0
+"""Seconds between two looks at a drive's greatest speed."""
+LIMITED_POLL: Final = 0.02
+"""The same while the drive says that it is too slow for its set points."""
 SETTLE: Final = 0.05
 """Seconds that nodes are given after a reset of their communication."""
 INPUT_TIMER_MS: Final = 100
@@ -103,6 +107,7 @@ class DriveLink:
         self.max_speed = 0.0
         self.error_code = 0
         self.controlword = 0
+        self._asked = 0.2 * node  # not all at once
         self._wait = 0
         self._stopping = 0
 
@@ -138,6 +143,22 @@ class DriveLink:
             return f"node {self.node} does not know cyclic synchronous position"
         self.max_speed = from_units(self.sdo.results[Object.MAX_SPEED, 0])
         return ""
+
+    @property
+    def limited(self) -> bool:
+        """Whether the drive cuts its set points because they are faster than it goes."""
+        return bool(self.statusword & StatusBit.INTERNAL_LIMIT)
+
+    def ask_speed(self, now: float) -> list[Frame]:
+        """Read the drive's greatest speed again when it is time, sooner if it is `limited`: drives may slow down by themselves."""
+        if self.sdo.busy:
+            return self.sdo.advance(now)
+        self.max_speed = from_units(self.sdo.results.get((Object.MAX_SPEED, 0), to_units(self.max_speed)))
+        if now - self._asked < (LIMITED_POLL if self.limited else SPEED_POLL):
+            return []
+        self._asked = now
+        self.sdo.begin([Transfer(Object.MAX_SPEED, 0, _U32)])
+        return self.sdo.advance(now)
 
     def take(self, data: bytes) -> None:
         """The drive's TPDO. Raises ValueError for bytes that are none."""
@@ -201,7 +222,12 @@ class DriveMaster:
     @property
     def limited(self) -> bool:
         """Whether a drive cuts its set points because they are faster than it goes."""
-        return any(drive.statusword & StatusBit.INTERNAL_LIMIT for drive in self.drives)
+        return any(drive.limited for drive in self.drives)
+
+    @property
+    def speeds(self) -> tuple[float, ...]:
+        """Greatest speeds as the drives last said (rad/s)."""
+        return tuple(drive.max_speed for drive in self.drives)
 
     def reset(self, now: float) -> None:
         """Forget troubles, reset faults and enable again; configure again if the bus was the trouble."""
@@ -256,6 +282,8 @@ class DriveMaster:
                 for drive, target in zip(self.drives, targets, strict=True)
             ]
             frames.append(canopen.SYNC)
+            for drive in self.drives:
+                frames += drive.ask_speed(now)
         return frames
 
     def _configure(self, now: float) -> list[Frame]:

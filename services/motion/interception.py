@@ -62,13 +62,13 @@ class Strategy:
     depths: tuple[float, ...]
     preferred: float
     opening: float
-    hands: tuple[float, ...] = tuple(math.radians(angle) for angle in range(-75, 91, 15))
+    hands: tuple[float, ...] = tuple(math.radians(angle) for angle in range(-75, 76, 15))
     margin: float = 0.03
     """Seconds by which the arm wants to be there before the ball: the drives' lag and settling."""
 
 
 STRATEGIES: Final = {
-    "tilted": Strategy(math.radians(30.0), (0.045, 0.055, 0.065, 0.08, 0.10, 0.13), 0.055, 0.70),
+    "tilted": Strategy(math.radians(30.0), (0.045, 0.055, 0.065, 0.08, 0.10, 0.13, 0.17, 0.21), 0.055, 0.70),
     "upright": Strategy(0.0, (0.08, 0.11, 0.14, 0.17, 0.20, 0.24, 0.28), 0.11, 0.72),
 }
 """By name: `tilted` receives the ball head-on just below the edge, `upright` lets it fall into a level cup further down."""
@@ -79,6 +79,12 @@ DEPTH_COST: Final = 2.0
 """s per m off the preferred depth."""
 CLOSED_COST: Final = 4.0
 """s per unit of cosine by which the mouth is less open to the ball than it should be."""
+ROOM: Final = 0.075
+"""m from the table's edge to the cup's mouth from which the arm has room to move sideways."""
+EDGE_COST: Final = 8.0
+"""s per m closer to the edge than that."""
+RETREAT: Final = 0.08
+"""m from a catching pose back to the pose from which it is approached where the straight way is not clear."""
 LATE_COST: Final = 20.0
 """Weight of each second too late."""
 EARLY: Final = 0.05
@@ -174,6 +180,13 @@ class Interceptor:
                     int(index),
                 )
         return None
+
+    def retreat(self, q: Sequence[float]) -> tuple[float, ...] | None:
+        """The pose that holds the cup as in a joint pose but further from the table; None if there is none that is clear."""
+        pose = self._puma.forward(np.asarray(q))
+        pose[0, 3] -= RETREAT
+        back: list[float] = self._puma.inverse(pose, (self._branch,), near=np.asarray(q))[0].tolist()
+        return tuple(back) if math.isfinite(back[0]) and not self._guard.violation(back) else None
 
     def _layout(self, strategy: Strategy) -> _Layout:
         if strategy not in self._layouts:

@@ -99,6 +99,13 @@ class Guard:
             return "wrist at the pedestal"
         return ""
 
+    def path_clear(self, start: Sequence[float], end: Sequence[float], parts: int = 5) -> bool:
+        """Whether the straight way between two joint poses is clear, looked at in so many places."""
+        steps = [number / parts for number in range(1, parts + 1)]
+        return not any(
+            self.violation([a + share * (b - a) for a, b in zip(start, end, strict=True)]) for share in steps
+        )
+
     def advance(self, trajectory: Trajectory) -> str:
         """Move a trajectory on by one cycle; gives what it refused to touch, in words, empty if it went on as it wished.
 

@@ -158,6 +158,23 @@ def test_it_holds_within_three_periods_of_the_stream(rig: Any) -> None:
     assert rig.arm.state()["in_place"], "it goes on when set points come again"
 
 
+@pytest.mark.parametrize("y", [-0.3, 0.3])
+@pytest.mark.parametrize("speed", [0.38, 0.5])
+def test_slow_balls_close_to_the_edge_are_reached_by_a_way_round(rig: Any, y: float, speed: float) -> None:
+    begun = rig.now
+    for cycle in range(250):
+        if cycle % 20 == 0:
+            rig.arm.command(rig.now, {"do": "follow"})
+        if cycle % 5 == 0:
+            rig.feed(_point(y, 1.2 - (rig.now - begun), speed))
+        rig.tick()
+        assert rig.arm._guard.violation(rig.arm.state()["commanded"]) == ""
+    assert rig.arm.state()["in_place"]
+    rig.arm.command(rig.now, {"do": "move", "pose": "home"})
+    assert rig.run(3.0, lambda: bool(rig.arm.state()["in_place"]))
+    _check_limits(rig)
+
+
 def test_bad_set_points_do_not_keep_an_old_one_alive(rig: Any) -> None:
     _follow(rig, 0.1, y=0.3)
     rubbish = 0
@@ -371,6 +388,23 @@ def test_a_slow_arm_is_driven_at_its_own_speed(make_rig: Any, factor: float) -> 
     assert not rig.arm.state()["limited"]
     speeds = np.abs(np.diff(np.array(rig.commanded[1:]), axis=0)) / CYCLE
     assert np.all(speeds <= factor * ARM.speed)
+
+
+@pytest.mark.parametrize("factor", [0.5, 0.3])
+def test_an_arm_that_slows_down_in_mid_motion_is_followed_by_its_commands(rig: Any, factor: float) -> None:
+    _follow(rig, 0.2, y=-0.3)
+    rig.drives.slow_down(factor)
+    _follow(rig, 3.3, y=0.3, arrival=3.5)
+    assert rig.arm.state()["faults"] == []
+    assert rig.arm.state()["in_place"]
+    assert rig.arm.state()["following_error"] < 0.01
+    rig.drives.slow_down(1.0)
+    rig.run(1.2)
+    rig.arm.command(rig.now, {"do": "move", "pose": AWAY})
+    begun = len(rig.commanded)
+    assert rig.run(4.0, lambda: bool(rig.arm.state()["in_place"]))
+    speeds = np.abs(np.diff(np.array(rig.commanded[begun:]), axis=0)) / CYCLE
+    assert np.max(speeds / ARM.speed) > 0.9, "it knows that the arm is fast again"
 
 
 def test_a_ball_in_the_cup_is_told_once_when_it_has_come_to_stay(rig: Any) -> None:
