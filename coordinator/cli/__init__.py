@@ -42,6 +42,7 @@ COMMANDS = (
     Command("node", "launch one node"),
     Command("sim", "launch the simulated laboratory"),
     Command("calibrate", "calibrate a camera from images of a board"),
+    Command("keys", "make the shared key that several hosts need"),
     Command("new", "write the skeleton of an action or a task"),
 )
 
