@@ -35,6 +35,7 @@ LIGHT_DIRECTION = np.array([-0.25, 0.35, 0.90]) / np.linalg.norm([-0.25, 0.35, 0
 """Towards the lamp, base frame."""
 LENS_STEPS = 6
 CIRCLE = np.stack([f(np.linspace(0.0, 2.0 * np.pi, 13)[:-1]) for f in (np.cos, np.sin)], axis=-1)
+RING = np.pad(CIRCLE, ((0, 0), (0, 1)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +71,16 @@ class View:
         return cls(**truth)
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class _Cover:
+    """What arm or cup hide: a convex hull (n, 1, 2) in sixteenths of a pixel, its grey level, its height (m)."""
+
+    hull: NDArray[np.int32]
+    grey: float
+    height: float
+    cup: bool
+
+
 class PinholeCamera:
     """The camera of the simulated laboratory. The same generator state and the same calls give the same images."""
 
@@ -88,6 +99,7 @@ class PinholeCamera:
         self.position: Array = np.asarray(camera["position"] if view.position is None else view.position, float)
         self.rotation: Array = _looking_down(camera) if view.rotation is None else np.asarray(view.rotation, float)
         self._rng = rng
+        self._covered: tuple[bytes, list[_Cover]] = (b"", [])
         sigma = float(camera["noise"] if view.noise is None else view.noise)
         field = NOISE_ZERO + sigma * rng.standard_normal((NOISE_SIZE, NOISE_SIZE), np.float32)
         self._noise: Picture = np.clip(np.rint(field), 0, 255).astype(np.uint8)
@@ -190,25 +202,17 @@ class PinholeCamera:
         capsule of the arm, arm_radii (n,) m; cup_pose (4, 4): the cup's mouth centre with z out of the mouth; light: factor.
         """
         picture = self.background.copy()
-        capsules = (
-            [] if arm_points is None else list(zip(np.asarray(arm_points, float), np.ravel(arm_radii), strict=True))
-        )
         pose = None if cup_pose is None else np.asarray(cup_pose, float)
-        centre = None if ball is None else np.asarray(ball, float)
-        above = np.inf if centre is None else centre[2]
-        for ends, radius in capsules:
-            if ends[:, 2].mean() <= above:
-                self._paint_capsule(picture, ends, float(radius), ARM_GREY)
-        ball_in_cup = centre is not None and pose is not None and self._inside_cup(centre, pose)
-        if pose is not None and (ball_in_cup or pose[2, 3] <= above):
-            self._paint_cup(picture, pose)
-        if centre is not None:
+        covers = self._covers(arm_points, arm_radii, pose)
+        if ball is None:
+            self._fill(picture, covers)
+        else:
+            centre = np.asarray(ball, float)
+            in_cup = pose is not None and self._inside_cup(centre, pose)
+            above = [cover for cover in covers if cover.height > centre[2] and not (cover.cup and in_cup)]
+            self._fill(picture, [cover for cover in covers if cover not in above])
             self._paint_ball(picture, centre, np.asarray(ball_velocity, float))
-        if pose is not None and not ball_in_cup and pose[2, 3] > above:
-            self._paint_cup(picture, pose)
-        for ends, radius in capsules:
-            if ends[:, 2].mean() > above:
-                self._paint_capsule(picture, ends, float(radius), ARM_GREY)
+            self._fill(picture, above)
         return self._expose(picture, light)
 
     def render_board(self, pose: ArrayLike, board: Chessboard | None = None, light: float = 1.0) -> Picture:
@@ -295,41 +299,67 @@ class PinholeCamera:
         top, bottom = max(0, int(v - reach_v)), min(self.height, int(v + reach_v) + 2)
         return (slice(top, bottom), slice(left, right)) if left < right and top < bottom else None
 
-    def _grey_at(self, uv: Array, grey: float) -> float:
-        u = int(np.clip(uv[0], 0, self.width - 1))
-        v = int(np.clip(uv[1], 0, self.height - 1))
-        return grey * float(self.illumination[v, u])
+    # Arm and cup: patches of one grey level, the same as long as neither moves
 
-    def _paint_capsule(self, picture: Picture, ends: Array, radius: float, grey: float) -> None:
-        depth = self.to_camera(ends)[:, 2]
-        if (depth < 4.0 * radius).any():
-            return  # at or behind the lens: out of focus anyway
-        pixels = self.project(ends)
-        sizes = radius * self.focal / depth
-        hull = cv2.convexHull(
-            np.rint((pixels[:, None] + sizes[:, None, None] * CIRCLE) * 16).astype(np.int32).reshape(-1, 2)
-        )
-        cv2.fillConvexPoly(picture, hull, self._grey_at(pixels.mean(axis=0), grey), cv2.LINE_AA, 4)
+    def _covers(self, arm_points: ArrayLike | None, arm_radii: ArrayLike, pose: Array | None) -> list[_Cover]:
+        points = np.empty((0, 2, 3)) if arm_points is None else np.asarray(arm_points, float).reshape(-1, 2, 3)
+        radii = np.asarray(arm_radii, float).ravel()
+        key = points.tobytes() + radii.tobytes() + (b"" if pose is None else pose.tobytes())
+        if key != self._covered[0]:
+            arm = self._arm_covers(points, radii) if len(points) else []
+            self._covered = key, arm + ([] if pose is None else self._cup_covers(pose))
+        return self._covered[1]
+
+    def _arm_covers(self, points: Array, radii: Array) -> list[_Cover]:
+        """The hull of both ends' discs for each capsule that is in view."""
+        if len(points) != len(radii):
+            raise ValueError(f"{len(points)} capsules of the arm, but {len(radii)} radii")
+        depth = self.to_camera(points)[..., 2]
+        # at or behind the lens: out of focus anyway
+        seen = (depth > 4.0 * radii[:, None]).all(axis=1)
+        points, radii, depth = points[seen], radii[seen], depth[seen]
+        rims = self.project(points)[:, :, None] + (radii[:, None] * self.focal / depth)[..., None, None] * CIRCLE
+        heights = points[..., 2].mean(axis=1)
+        return [
+            self._cover(rim.reshape(-1, 2), ARM_GREY, float(height))
+            for rim, height in zip(rims, heights, strict=True)
+            if self._in_view(rim)
+        ]
+
+    def _cup_covers(self, pose: Array) -> list[_Cover]:
+        """The wall as the hull of both rims, then the dark mouth as far as it faces the camera."""
+        bottom = np.array([0.0, 0.0, -self.cup_depth])
+        outer = RING * (self.cup_radius + CUP_WALL)
+        points = np.concatenate([outer, outer + bottom, RING * self.cup_radius]) @ pose[:3, :3].T + pose[:3, 3]
+        if (self.to_camera(points)[:, 2] < 0.1).any():
+            return []
+        pixels, height = self.project(points), float(pose[2, 3])
+        wall, mouth = pixels[: 2 * len(RING)], pixels[2 * len(RING) :]
+        if not self._in_view(wall):
+            return []
+        covers = [self._cover(wall, CUP_GREY, height, cup=True)]
+        if (self.position - pose[:3, 3]) @ pose[:3, 2] > 0.0:
+            covers.append(self._cover(mouth, CUP_INSIDE_GREY, height, cup=True))
+        return covers
+
+    def _in_view(self, pixels: Array) -> bool:
+        low, high = pixels.reshape(-1, 2).min(axis=0), pixels.reshape(-1, 2).max(axis=0)
+        return bool(high[0] >= 0 and high[1] >= 0 and low[0] < self.width and low[1] < self.height)
+
+    def _cover(self, pixels: Array, grey: float, height: float, cup: bool = False) -> _Cover:
+        """The convex hull of pixels in its middle's light."""
+        u, v = pixels.mean(axis=0)
+        light = self.illumination[min(max(int(v), 0), self.height - 1), min(max(int(u), 0), self.width - 1)]
+        hull = np.asarray(cv2.convexHull(np.rint(pixels * 16).astype(np.int32)), np.int32)
+        return _Cover(hull, grey * float(light), height, cup)
+
+    def _fill(self, picture: Picture, covers: Sequence[_Cover]) -> None:
+        for cover in covers:
+            cv2.fillConvexPoly(picture, cover.hull, cover.grey, cv2.LINE_AA, 4)
 
     def _inside_cup(self, ball: Array, pose: Array) -> bool:
         local = (ball - pose[:3, 3]) @ pose[:3, :3]
         return bool(np.hypot(local[0], local[1]) < self.cup_radius and -self.cup_depth < local[2] < self.ball_radius)
-
-    def _paint_cup(self, picture: Picture, pose: Array) -> None:
-        """The wall as the hull of both rims, then the dark mouth as far as it faces the camera."""
-        ring = np.pad(CIRCLE, ((0, 0), (0, 1)))
-        bottom = np.array([0.0, 0.0, -self.cup_depth])
-        outer = ring * (self.cup_radius + CUP_WALL)
-        rims = np.concatenate([outer, outer + bottom]) @ pose[:3, :3].T + pose[:3, 3]
-        mouth = ring * self.cup_radius @ pose[:3, :3].T + pose[:3, 3]
-        if (self.to_camera(rims)[:, 2] < 0.1).any():
-            return
-        pixels = self.project(rims)
-        hull = cv2.convexHull(np.rint(pixels * 16).astype(np.int32))
-        cv2.fillConvexPoly(picture, hull, self._grey_at(pixels[0], CUP_GREY), cv2.LINE_AA, 4)
-        if (self.position - pose[:3, 3]) @ pose[:3, 2] > 0.0:
-            inside = np.rint(self.project(mouth) * 16).astype(np.int32)
-            cv2.fillConvexPoly(picture, inside, self._grey_at(pixels[0], CUP_INSIDE_GREY), cv2.LINE_AA, 4)
 
 
 def _looking_down(camera: Mapping[str, Any]) -> Array:
