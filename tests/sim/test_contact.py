@@ -142,11 +142,11 @@ def side(cup: Frame3, ball: BallState) -> str:
 
 
 def shoot(space: ContactSpace, rng: np.random.Generator) -> set[tuple[str, str]]:
-    """A ball shot at a cup that moves and turns; gives the changes of place that were seen."""
+    """A ball shot at a cup that moves and turns, from anywhere or into the mouth; gives the changes of place that were seen."""
     velocity, spin = rng.uniform(-1.0, 1.0, 3), rng.uniform(-2.0, 2.0, 3)
     turn, place = rotation_from_vector(rng.uniform(-1.2, 1.2, 3)), np.array([0.0, 0.0, 0.5])
     middle = place - 0.035 * turn[:, 2]
-    way = rng.normal(size=3)
+    way = rng.normal(size=3) if rng.random() < 0.5 else 0.3 * rng.normal(size=3) - turn[:, 2]
     way /= np.linalg.norm(way)
     speed = rng.uniform(0.5, 3.5)
     aim = middle + rng.uniform(-0.03, 0.03, 3)
