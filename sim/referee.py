@@ -39,17 +39,19 @@ class Referee:
         return self._entries[-1].verdict if self._entries else None
 
     def score(self, now: float, cycles: Sequence[Mapping[str, Any]] = ()) -> dict[str, Any]:
-        """All throws so far in plain data: see `_row` for a throw; counts are of throws that are over.
+        """All throws so far in plain data: `throws` (see `_row`) and, for those who look closer, `courses` (see `_course`);
+        counts are of throws that are over.
 
         `cycles` are the caller's cycles: `begun_ago`, `ended_ago` (s before `now`), `status` and `cause`. A throw takes the
         status of the cycle in which it was released, None if it was released in none.
         """
-        rows = [_row(entry, self._began) | _status(entry.course, now, cycles) for entry in self._entries]
+        rows = [_row(entry) | _status(entry.course, now, cycles) for entry in self._entries]
         over = [row for row in rows if row["outcome"] != Outcome.ROLLING]
         return {
             "seed": self._seed,
             "regime": self._regime,
             "throws": rows,
+            "courses": [_course(entry, self._began) for entry in self._entries],
             "over": len(over),
             "caught": sum(row["caught"] for row in over),
             "reachable": sum(row["reachable"] for row in over),
@@ -65,26 +67,33 @@ def _status(course: Course, now: float, cycles: Sequence[Mapping[str, Any]]) -> 
     return {"status": None, "cause": ""}
 
 
-def _row(entry: _Entry, began: float) -> dict[str, Any]:
-    """One throw: lengths in mm where the key says so, else SI; durations count from its release, None: it did not happen."""
+def _row(entry: _Entry) -> dict[str, Any]:
+    """One throw: its speed at release (m/s), what became of it, how far from the middle of the mouth it came (mm)."""
     course, verdict = entry.course, entry.verdict
-    throw, exit_state = course.throw, course.exit_state
     return {
-        "n": throw.n,
-        "speed": throw.speed,
+        "n": course.throw.n,
+        "speed": course.throw.speed,
         "caught": course.outcome is Outcome.CAUGHT,
         "outcome": str(course.outcome),
         "miss_mm": _finite(1000.0 * course.miss),
         "reachable": verdict.reachable,
-        "margin": _finite(verdict.margin),
+    }
+
+
+def _course(entry: _Entry, began: float) -> dict[str, Any]:
+    """How one throw went, in m, m/s and s; durations count from its release, None: it did not happen."""
+    course, exit_state = entry.course, entry.course.exit_state
+    return {
+        "n": course.throw.n,
+        "released_after": course.released_at - began,
+        "spin_share": course.throw.spin_share,
+        "rolling_resistance": course.throw.rolling_resistance,
+        "exit_after": _finite(course.exit_time),
         "exit_y": exit_state.position[1] if exit_state else None,
         "exit_speed": math.hypot(*exit_state.velocity) if exit_state else None,
-        "exit_after": _finite(course.exit_time),
         "caught_after": _finite(course.caught_at),
         "ended_after": _finite(course.ended_at),
-        "released_after": course.released_at - began,
-        "spin_share": throw.spin_share,
-        "rolling_resistance": throw.rolling_resistance,
+        "margin": _finite(entry.verdict.margin),
     }
 
 

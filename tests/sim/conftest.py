@@ -259,7 +259,7 @@ def run_digests(seed: int, regime: str, prepared_before: bool = False) -> list[s
         pixels.update(repr((arrived, body["age"], body["sequence"])).encode())
         pixels.update(body["pixels"].tobytes())
     made.lab.close()
-    told = json.dumps(rows) + repr(made.master.position.tolist())
+    told = json.dumps(made.lab.referee.score(made.now)) + json.dumps(rows) + repr(made.master.position.tolist())
     return [hashlib.sha256(told.encode()).hexdigest(), pixels.hexdigest()]
 
 

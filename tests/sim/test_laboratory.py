@@ -235,6 +235,9 @@ def test_prepare_begins_a_new_experiment(bench: Benches) -> None:
     assert here.lab.world.course is None  # one throw was asked for
     score = here.call("laboratory_score").values
     assert (score["seed"], score["regime"], score["over"], score["caught"]) == (5, "C+dim", 1, 1)
+    course = score["courses"][0]
+    assert 0.0 < course["exit_after"] < course["caught_after"] < course["ended_after"] and course["margin"] > 0.0
+    assert abs(course["exit_y"]) < 0.31 and 1.5 < course["exit_speed"] < 2.5
 
 
 def test_a_throw_takes_the_status_of_its_cycle(bench: Benches) -> None:
@@ -242,7 +245,7 @@ def test_a_throw_takes_the_status_of_its_cycle(bench: Benches) -> None:
     here.enable()
     here.want_images(0.001)
     here.catch_one()
-    released = here.lab.referee.score(here.now)["throws"][0]["released_after"]
+    released = here.lab.referee.score(here.now)["courses"][0]["released_after"]
     ago = here.now - released
     cycles = [
         {"n": 1, "begun_ago": ago + 5.0, "ended_ago": ago + 1.0, "status": "failure", "cause": "x"},
