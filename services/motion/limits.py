@@ -1,7 +1,7 @@
 """The guard: joint limits, table, floor and pedestal that no set point can pass.
 
 A commanded step is allowed only if the pose in which the arm would come to rest, braking from after that step, is clear,
-and so is the middle of the way there if it is long. So at every moment the arm can stop without touching anything; where a
+and so is the way there if it is long. So at every moment the arm can stop without touching anything; where a
 step is refused the servo brakes on the way that was found clear one cycle before.
 """
 
@@ -23,6 +23,8 @@ ARM_MARGIN = 0.01
 """m between arm and table, and of everything to floor and pedestal."""
 NEAR = 0.02
 """rad of braking below which the way to rest is too short (10 mm at the cup) to need a look at its middle."""
+LOOKS = (0.0, 0.25, 0.5)
+"""Shares of the braking time at which a long way to rest is looked at, besides its end."""
 JOINT_SLACK = 1e-6
 """rad by which rounding may carry a command beyond a joint limit."""
 
@@ -39,35 +41,61 @@ class Placement(NamedTuple):
 class Guard:
     """Knows what is solid in the cell. Plain floats: one pose at a time, twice a cycle."""
 
-    def __init__(self, puma: Puma, model: ArmModel, cell: Cell) -> None:
+    def __init__(
+        self, puma: Puma, model: ArmModel, cell: Cell, cup_margin: float = CUP_MARGIN, arm_margin: float = ARM_MARGIN
+    ) -> None:
+        """Margins (m) are between cup and table, and of everything else; they cover what happens between the poses looked at."""
+        self._cup_margin, self._arm_margin = cup_margin, arm_margin
         self._puma = puma
         self._body = model.body
         self._cell = cell
         self._limits = list(zip(model.lower.tolist(), model.upper.tolist(), strict=True))
         self._length = cell.cup.depth + cell.cup.wall
         self._radius = cell.cup.radius + cell.cup.wall
+        mouth, axis = cell.cup.mouth, cell.cup.axis
+        ends = (
+            math.hypot(*(m - length * a for m, a in zip(mouth, axis, strict=True))) for length in (0.0, self._length)
+        )
+        self._swing = max(ends) + self._radius
+        """m from the wrist's centre within which the whole cup is."""
 
     def place(self, q: Sequence[float]) -> Placement:
         """Where forearm and cup are in a joint pose."""
-        puma = self._puma
-        c1, s1, c2, s2 = math.cos(q[0]), math.sin(q[0]), math.cos(q[1]), math.sin(q[1])
-        c23, s23 = math.cos(q[1] + q[2]), math.sin(q[1] + q[2])
-        reach = puma.a2 * c2 + puma.a3 * c23
-        height = puma.d1 + puma.a2 * s2 + puma.a3 * s23
-        elbow = (reach * c1 + puma.d3 * s1, reach * s1 - puma.d3 * c1, height)
-        reach -= puma.d4 * s23
-        wrist = (reach * c1 + puma.d3 * s1, reach * s1 - puma.d3 * c1, height + puma.d4 * c23)
-        turn = _Turn(c1, s1, c23, s23, q[3], q[4], q[5])
+        elbow, wrist = self._forearm(q)
+        turn = _Turn(q)
         offset, axis = turn.apply(self._cell.cup.mouth), turn.apply(self._cell.cup.axis)
         return Placement(elbow, wrist, (wrist[0] + offset[0], wrist[1] + offset[1], wrist[2] + offset[2]), axis)
+
+    def _forearm(self, q: Sequence[float]) -> tuple[Point, Point]:
+        """Both ends of the forearm."""
+        puma = self._puma
+        c1, s1, c23, s23 = math.cos(q[0]), math.sin(q[0]), math.cos(q[1] + q[2]), math.sin(q[1] + q[2])
+        reach = puma.a2 * math.cos(q[1]) + puma.a3 * c23
+        height = puma.d1 + puma.a2 * math.sin(q[1]) + puma.a3 * s23
+        elbow = (reach * c1 + puma.d3 * s1, reach * s1 - puma.d3 * c1, height)
+        reach -= puma.d4 * s23
+        return elbow, (reach * c1 + puma.d3 * s1, reach * s1 - puma.d3 * c1, height + puma.d4 * c23)
 
     def violation(self, q: Sequence[float]) -> str:
         """What a joint pose would touch, in words; empty if it is clear."""
         for number, (angle, (low, high)) in enumerate(zip(q, self._limits, strict=True), 1):
             if not low - JOINT_SLACK <= angle <= high + JOINT_SLACK:
                 return f"joint {number} beyond its limit"
-        at = self.place(q)
-        return self._cup_touches(at) or self._arm_touches(at)
+        elbow, wrist = self._forearm(q)
+        touched = self._arm_touches(elbow, wrist)
+        if touched or self._far(wrist):
+            return touched
+        return self._cup_touches(self.place(q))
+
+    def _far(self, wrist: Point) -> bool:
+        """Whether the wrist is so far from everything that the cup is clear however it is turned."""
+        x, y, z = wrist
+        inner = self._body.base + self._arm_margin + self._swing
+        return (
+            x + self._swing < self._cell.near_edge - self._cup_margin
+            and z - self._swing > self._arm_margin
+            and math.hypot(x, y) > inner
+        )
 
     def _cup_touches(self, at: Placement) -> str:
         """The cup as a cylinder: extents of its two end discs."""
@@ -75,27 +103,30 @@ class Guard:
         bottom = tuple(m - self._length * a for m, a in zip(at.mouth, axis, strict=True))
         ahead = max(at.mouth[0], bottom[0]) + self._radius * math.sqrt(max(0.0, 1.0 - axis[0] * axis[0]))
         low = min(at.mouth[2], bottom[2]) - self._radius * math.sqrt(max(0.0, 1.0 - axis[2] * axis[2]))
-        if ahead > cell.near_edge - CUP_MARGIN and low < cell.table_top + CUP_MARGIN:
+        if ahead > cell.near_edge - self._cup_margin and low < cell.table_top + self._cup_margin:
             return "cup at the table"
-        if low < ARM_MARGIN:
+        if low < self._arm_margin:
             return "cup at the floor"
         for x, y, z in (at.mouth, bottom):
-            if z < self._puma.d1 + self._body.base and math.hypot(x, y) < self._body.base + self._radius + ARM_MARGIN:
+            if (
+                z < self._puma.d1 + self._body.base
+                and math.hypot(x, y) < self._body.base + self._radius + self._arm_margin
+            ):
                 return "cup at the pedestal"
         return ""
 
-    def _arm_touches(self, at: Placement) -> str:
+    def _arm_touches(self, elbow: Point, wrist: Point) -> str:
         """Forearm and wrist as spheres along the forearm."""
         cell, body = self._cell, self._body
         for share, radius in ((0.0, body.forearm), (0.5, body.forearm), (0.75, body.forearm), (1.0, body.wrist)):
-            x = at.elbow[0] + share * (at.wrist[0] - at.elbow[0])
-            z = at.elbow[2] + share * (at.wrist[2] - at.elbow[2])
-            if x + radius > cell.near_edge - ARM_MARGIN and z - radius < cell.table_top + ARM_MARGIN:
+            x = elbow[0] + share * (wrist[0] - elbow[0])
+            z = elbow[2] + share * (wrist[2] - elbow[2])
+            if x + radius > cell.near_edge - self._arm_margin and z - radius < cell.table_top + self._arm_margin:
                 return "forearm at the table"
-            if z - radius < ARM_MARGIN:
+            if z - radius < self._arm_margin:
                 return "forearm at the floor"
-        x, y, z = at.wrist
-        if z < self._puma.d1 + body.base and math.hypot(x, y) < body.base + body.wrist + ARM_MARGIN:
+        x, y, z = wrist
+        if z < self._puma.d1 + body.base and math.hypot(x, y) < body.base + body.wrist + self._arm_margin:
             return "wrist at the pedestal"
         return ""
 
@@ -115,8 +146,9 @@ class Guard:
         q, qd = trajectory.proposed()
         rest = trajectory.resting(q, qd)
         refused = self.violation(rest)
-        if not refused and any(abs(b - a) > NEAR for a, b in zip(q, rest, strict=True)):
-            refused = self.violation([0.5 * (a + b) for a, b in zip(q, rest, strict=True)])
+        if any(abs(b - a) > NEAR for a, b in zip(q, rest, strict=True)):
+            for share in LOOKS:
+                refused = refused or self.violation(trajectory.stopping(q, qd, share))
         if refused and not self.violation(trajectory.resting(trajectory.q, trajectory.qd)):
             trajectory.accept(*trajectory.braking())
             return refused
@@ -127,17 +159,15 @@ class Guard:
 class _Turn:
     """Rotation of frame 6 in the base frame, applied to vectors."""
 
-    def __init__(self, c1: float, s1: float, c23: float, s23: float, q4: float, q5: float, q6: float) -> None:
-        self._first = c1, s1, c23, s23
-        self._wrist = math.cos(q4), math.sin(q4), math.cos(q5), math.sin(q5), math.cos(q6), math.sin(q6)
+    def __init__(self, q: Sequence[float]) -> None:
+        self._angles = [(math.cos(a), math.sin(a)) for a in (q[0], q[1] + q[2], q[3], q[4], q[5])]
 
     def apply(self, vector: Point) -> Point:
         """A vector of frame 6 in the base frame."""
-        c1, s1, c23, s23 = self._first
-        c4, s4, c5, s5, c6, s6 = self._wrist
+        (c1, s1), (c23, s23), (c4, s4), (c5, s5), (c6, s6) = self._angles
         x, y, z = vector
         x, y = c6 * x - s6 * y, s6 * x + c6 * y
-        x, y, z = c5 * x - s5 * z, y, s5 * x + c5 * z  # y5 is -z4: Rx(-90) and Rx(+90) cancel
+        x, z = c5 * x - s5 * z, s5 * x + c5 * z  # the twists before and after joint 5 cancel
         x, y = c4 * x - s4 * y, s4 * x + c4 * y
         radial, up = c23 * x - s23 * z, s23 * x + c23 * z
         return c1 * radial - s1 * y, s1 * radial + c1 * y, up

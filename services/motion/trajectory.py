@@ -144,6 +144,15 @@ class Trajectory:
         period = self.period
         return [angle + braking_distance(v, period, a) for angle, v, a in zip(q, qd, self._brakes, strict=True)]
 
+    def stopping(self, q: Sequence[float], qd: Sequence[float], share: float) -> list[float]:
+        """Where the joints are after a share of the time that braking from here takes, the slowest joint deciding."""
+        times = [self.period * braking_cycles(v, self.period, a) for v, a in zip(qd, self._brakes, strict=True)]
+        now = share * max(times)
+        return [
+            angle + v * (min(now, time) - 0.5 * min(now, time) ** 2 / time if time else 0.0)
+            for angle, v, time in zip(q, qd, times, strict=True)
+        ]
+
     def accept(self, q: list[float], qd: list[float]) -> None:
         """Make a proposed or braking state the present one."""
         self.q, self.qd = q, qd

@@ -72,9 +72,13 @@ def test_braking_ends_where_it_was_said_to_end(target: list[float], cycles: int)
     trajectory.aim(target)
     for _ in range(cycles):
         _advance(trajectory)
-    rest = trajectory.resting(trajectory.q, trajectory.qd)
-    for _ in range(200):
+    rest, q, qd = trajectory.resting(trajectory.q, trajectory.qd), trajectory.q, trajectory.qd
+    path = [q]
+    while not trajectory.still:
         trajectory.accept(*trajectory.braking())
+        path.append(trajectory.q)
+    for number, pose in enumerate(path):
+        assert np.allclose(trajectory.stopping(q, qd, number / max(len(path) - 1, 1)), pose, atol=1e-9)
     assert trajectory.still
     assert np.allclose(trajectory.q, rest, atol=1e-9)
 
