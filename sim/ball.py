@@ -3,7 +3,7 @@
 A ball on a table slides while its lowest point moves, then rolls. With sliding friction mu the slip velocity keeps its
 direction and shrinks at mu g (1 + 1/k), where k = I / (m r^2); a rolling ball then loses c g of speed each second
 (c: coefficient of rolling resistance). Both phases have closed forms, so no step size enters. Source: rigid-body
-mechanics of a sphere on a plane (e.g. Goldsmith; Marlow, "The Physics of Pocket Billiards", 1995).
+mechanics of a sphere on a plane (e.g. Marlow, "The Physics of Pocket Billiards", 1995).
 """
 
 from __future__ import annotations
