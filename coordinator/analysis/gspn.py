@@ -71,14 +71,15 @@ class Gspn:
     ) -> Gspn:
         """Name the timed transitions with their rates; all others are immediate (weight 1, and above the timed ones).
 
-        The net's own priorities order the immediate transitions.
+        The net's own priorities order the immediate transitions; they are raised together if the lowest is below 1.
         """
         for given in (rates, weights or {}, servers or {}):
             unknown = [name for name in given if name not in net.transition_index]
             if unknown:
                 raise ValueError(f"{unknown[0]!r} is no transition of the net")
-        least = min(net.priority, default=0)
-        priority = tuple(0 if t in rates else net.priority[i] - least + 1 for i, t in enumerate(net.transitions))
+        immediate = [own for t, own in zip(net.transitions, net.priority, strict=True) if t not in rates]
+        lift = max(0, 1 - min(immediate, default=1))
+        priority = tuple(0 if t in rates else own + lift for t, own in zip(net.transitions, net.priority, strict=True))
         return cls(
             replace(net, priority=priority),
             tuple(float(rates[t]) if t in rates else None for t in net.transitions),

@@ -1,0 +1,50 @@
+"""Net files by their endings: read any known one, write any that can be written, list what gets lost on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from coordinator.analysis import dot, pnml_writing, storm, tina
+from coordinator.analysis.greatspn import parse_pnpro
+from coordinator.analysis.gspn import Chain
+from coordinator.analysis.netfile import FormatError, NetFile
+from coordinator.analysis.pnml_reading import parse_pnml
+
+READ: dict[str, Callable[[str, str], NetFile]] = {
+    ".pnml": parse_pnml,
+    ".xml": parse_pnml,
+    ".pnpro": parse_pnpro,
+    ".net": tina.parse_tina,
+}
+"""Readers by ending: `.xml` is what PIPE writes (PNML)."""
+WRITE = (".pnml", ".net", ".dot", ".drn")
+"""Endings that can be written."""
+
+
+def read_net(path: Path) -> NetFile:
+    """The net in a file. Raises FormatError, also for a file that cannot be opened."""
+    reader = READ.get(path.suffix.lower())
+    if reader is None:
+        raise FormatError(str(path), "file", f"{path.suffix or 'no'} ending", f"known are {', '.join(READ)}")
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise FormatError(str(path), "file", str(error), "give a readable UTF-8 file") from error
+    return reader(text, str(path))
+
+
+def written(model: NetFile, ending: str) -> tuple[str, list[str]]:
+    """(text of the net in the format of an ending, what that format does not keep). Raises FormatError."""
+    match ending.lower():
+        case ".pnml":
+            return pnml_writing.write_pnml(model), pnml_writing.losses(model)
+        case ".net":
+            return tina.write_tina(model), tina.losses(model)
+        case ".dot":
+            return dot.write_dot(model), ["a drawing: priorities, capacities and rates"]
+        case ".drn":
+            if model.gspn is None:
+                raise FormatError("drn", "rates", "the net has none", "give rates: a CTMC needs them")
+            return storm.write_drn(Chain.of(model.gspn)), ["the net itself: only its chain is written"]
+    raise FormatError(ending, "file", "no writer for this ending", f"known are {', '.join(WRITE)}")

@@ -1,0 +1,356 @@
+"""Net files of other tools in, ours out: nothing changes its behaviour in silence."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+from hypothesis import given, settings
+
+from coordinator.analysis.formats import read_net, written
+from coordinator.analysis.greatspn import parse_pnpro
+from coordinator.analysis.gspn import Chain, Gspn
+from coordinator.analysis.markov import long_run
+from coordinator.analysis.netfile import FormatError, NetFile
+from coordinator.analysis.pnml_reading import parse_pnml
+from coordinator.analysis.pnml_writing import losses, write_pnml
+from coordinator.analysis.space import Limits, explore
+from coordinator.analysis.tina import parse_tina, write_tina
+from coordinator.net import Net
+from tests.analysis.generators import KANBAN_RATES, kanban, queue
+from tests.analysis.random_nets import gspns, nets
+
+ISO = """<?xml version="1.0"?>
+<pnml xmlns="http://www.pnml.org/version-2009/grammar/pnml">
+ <net id="n" type="http://www.pnml.org/version-2009/grammar/ptnet"><name><text>two pages</text></name>
+  <!-- kept -->
+  <page id="one">
+   <place id="p"><name><text>start</text><graphics><offset x="3" y="4"/></graphics></name>
+    <graphics><position x="10" y="20"/></graphics><initialMarking><text>2</text></initialMarking>
+    <toolspecific tool="paint" version="9"><colour>red</colour></toolspecific></place>
+   <transition id="t"/>
+   <arc id="a" source="p" target="t"><inscription><text>2</text></inscription></arc>
+   <arc id="b" source="t" target="r2"/>
+   <referencePlace id="r2" ref="r1"/>
+  </page>
+  <page id="two"><place id="q"/><referencePlace id="r1" ref="q"/><referenceTransition id="rt" ref="t"/>
+   <arc id="c" source="rt" target="q"/></page>
+ </net></pnml>"""
+
+
+def test_pages_and_references_are_followed() -> None:
+    model = parse_pnml(ISO)
+    assert model.net == Net.build({"p": 2, "q": 0}, {"t": ({"p": 2}, {"q": 2})})
+    assert model.labels == {"p": "start"} and model.positions == {"p": (10.0, 20.0)} and model.name == "two pages"
+    assert any("added up" in note for note in model.notes)
+
+
+def test_a_round_trip_keeps_pages_graphics_and_what_other_tools_wrote() -> None:
+    model = parse_pnml(ISO)
+    changed = replace(model, net=replace(model.net, initial=(5, 1)))
+    text = write_pnml(changed)
+    for kept in ('tool="paint"', "<colour>red</colour>", 'offset x="3"', "kept", 'id="two"', 'ref="q"', 'x="10"'):
+        assert kept in text
+    again = parse_pnml(text)
+    assert again.net == changed.net and again.labels == model.labels and again.notes == ()
+
+
+def test_removed_and_added_nodes_reach_the_file() -> None:
+    model = parse_pnml(ISO)
+    other = Net.build(
+        {"q": 1, "fresh": 0}, {"t": ({"q": 1}, {"fresh": 3}), "u": ({"fresh": 1}, {})}, inhibitors={"u": {"q": 2}}
+    )
+    again = parse_pnml(write_pnml(replace(model, net=other, positions={"fresh": (7.0, 8.0)})))
+    assert (again.net.initial, again.net.consume, again.net.produce, again.net.inhibit) == _in_order(other, again.net)
+    assert again.positions["fresh"] == (7.0, 8.0)
+
+
+@settings(max_examples=40, deadline=None)
+@given(nets())
+def test_pnml_round_trip_of_any_net(net: Net) -> None:
+    assert parse_pnml(write_pnml(NetFile(net))).net == net
+
+
+@settings(max_examples=40, deadline=None)
+@given(gspns())
+def test_pnml_round_trip_of_any_gspn(gspn: Gspn) -> None:
+    again = parse_pnml(write_pnml(NetFile(gspn.net, gspn=gspn)))
+    assert again.gspn is not None
+    assert (again.gspn.rate, again.gspn.servers, again.gspn.net.priority) == (
+        gspn.rate,
+        gspn.servers,
+        gspn.net.priority,
+    )
+    assert all(a == b for a, b, r in zip(again.gspn.weight, gspn.weight, gspn.rate, strict=True) if r is None)
+
+
+def arc_file(arc: str, extra: str = "") -> str:
+    return f"""<pnml><net id="n" type="P/T net"><place id="p"><initialMarking><text>1</text></initialMarking></place>
+    <place id="q"/><transition id="t"/><arc id="a" source="p" target="t" {extra}>{arc}</arc>
+    <arc id="b" source="t" target="q"/></net></pnml>"""
+
+
+@pytest.mark.parametrize(
+    ("arc", "extra"),
+    [
+        ("<arctype><text>inhibitor</text></arctype>", ""),
+        ("<arctype>inhibitor</arctype>", ""),
+        ('<type value="inhibitor"/>', ""),
+        ('<type value="inhibition"/>', ""),
+        ("<type><text>inhibitor</text></type>", ""),
+        ("", 'type="inhibitor"'),
+        ("", 'type="logicalInhibitor"'),
+        ("", 'type="tapnInhibitor"'),
+        ("<toolspecific tool='x' version='1'><inhibitor/></toolspecific>", ""),
+        ("<toolspecific tool='x' version='1'><type>inhibitor</type></toolspecific>", ""),
+        ("<toolspecific tool='x' version='1'><arcType>inhibitor</arcType></toolspecific>", ""),
+    ],
+)
+def test_inhibitor_arcs_in_every_notation(arc: str, extra: str) -> None:
+    net = parse_pnml(arc_file(arc + "<inscription><text>2</text></inscription>", extra)).net
+    assert net.inhibit == (((0, 2),),) and net.consume == ((),)
+
+
+@pytest.mark.parametrize("arc", ['<type value="test"/>', "<arctype><text>read</text></arctype>"])
+def test_test_arcs_look_and_leave(arc: str) -> None:
+    net = parse_pnml(arc_file(arc)).net
+    assert net.consume == (((0, 1),),) and net.produce == (((0, 1), (1, 1)),)
+
+
+@pytest.mark.parametrize(
+    ("arc", "extra"),
+    [
+        ('<type value="reset"/>', ""),
+        ("<arctype><text>hyper</text></arctype>", ""),
+        ("", 'type="transport"'),
+        ('<type value="inhibitor"/><arctype><text>read</text></arctype>', ""),
+        ("<toolspecific tool='x' version='1'><reset/></toolspecific>", ""),
+    ],
+)
+def test_unknown_arcs_are_refused_loudly(arc: str, extra: str) -> None:
+    with pytest.raises(FormatError, match=r"file\.pnml: arc a: an arc of the kind"):
+        parse_pnml(arc_file(arc, extra), "file.pnml")
+
+
+PIPE = """<pnml><net id="Net-One" type="P/T net"><token id="Default" red="0"/>
+<place id="P0"><initialMarking><value>Default,2</value></initialMarking><capacity><value>0</value></capacity></place>
+<place id="P1"><initialMarking><value>{empty}</value></initialMarking><capacity><value>3</value></capacity></place>
+<transition id="T0"><rate><value>2.5</value></rate><timed><value>true</value></timed><infiniteServer><value>true</value></infiniteServer><priority><value>1</value></priority></transition>
+<transition id="T1"><rate><value>0.5</value></rate><timed><value>false</value></timed><priority><value>2</value></priority></transition>
+<arc id="a" source="P0" target="T0"><inscription><value>Default,1</value></inscription><type value="normal"/></arc>
+<arc id="b" source="T0" target="P1"><inscription><value>1</value></inscription></arc>
+<arc id="c" source="P1" target="T1"><inscription><value></value></inscription></arc>
+<arc id="d" source="T1" target="P0"/></net></pnml>"""  # noqa: E501
+
+
+@pytest.mark.parametrize("empty", ["", "Default,0", "0", "Default,0,Red,0", "Default,"])
+def test_what_pipe_writes(empty: str) -> None:
+    model = parse_pnml(PIPE.format(empty=empty))
+    assert model.gspn is not None
+    assert model.net.initial == (2, 0) and model.net.capacity == (None, 3)
+    assert model.gspn.rate == (2.5, None) and model.gspn.weight[1] == 0.5 and model.gspn.servers[0] is None
+    again = parse_pnml(write_pnml(replace(model, net=replace(model.net, initial=(1, 0)))))
+    assert again.net.initial == (1, 0) and again.gspn is not None and again.gspn.rate == (2.5, None)
+
+
+def test_coloured_tokens_and_other_net_types_are_refused() -> None:
+    with pytest.raises(FormatError, match="colour 'Red'"):
+        parse_pnml(PIPE.format(empty="Default,0,Red,1"))
+    with pytest.raises(FormatError, match="only P/T nets"):
+        parse_pnml('<pnml><net id="n" type="http://www.pnml.org/version-2009/grammar/symmetricnet"/></pnml>')
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("<pnml><net id='n'>", "cut short"),
+        ("<pnml/>", "no <net>"),
+        ("<pnml><net id='a'/><net id='b'/></pnml>", "2 nets"),
+        ("<pnml><net id='n'><place/></net></pnml>", "no id"),
+        ("<pnml><net id='n'><place id='p'/><place id='p'/></net></pnml>", "stands there twice"),
+        ("<pnml><net id='n'><place id='p'/><arc id='a' source='p' target='x'/></net></pnml>", "joins a place and a transition"),
+        ("<pnml><net id='n'><place id='p'><initialMarking><text>two</text></initialMarking></place></net></pnml>", "has no value"),
+        ("<pnml><net id='n'><place id='p'><initialMarking><text>1.5</text></initialMarking></place></net></pnml>", "whole number"),
+        ("<pnml><net id='n'><referencePlace id='a' ref='b'/><referencePlace id='b' ref='a'/><transition id='t'/>"
+         "<arc id='c' source='a' target='t'/></net></pnml>", "circle"),
+    ],
+)  # fmt: skip
+def test_broken_files_say_where_and_what(text: str, said: str) -> None:
+    with pytest.raises(FormatError, match=said) as caught:
+        parse_pnml(text, "some.pnml")
+    assert str(caught.value).startswith("some.pnml: ")
+
+
+PNPRO = """<?xml version="1.0"?><project name="P" version="121"><gspn name="G"><nodes>
+<constant name="mu" consttype="REAL" value="2*(1+0.25)" x="1" y="1"/><constant name="N" consttype="INTEGER" value="3"/>
+<place marking="N" name="idle" x="1.5" y="2"/><place name="busy" x="3" y="2"/><text-box name="b" x="0" y="0">hello</text-box>
+<transition name="go" type="EXP" delay="mu" x="2" y="2"/><transition name="one" type="EXP" delay="1/4" nservers="1" x="2" y="2"/>
+<transition name="now" type="IMM" priority="2" weight="3" x="2" y="2"/></nodes><edges>
+<arc tail="idle" head="go" kind="INPUT" mult="2"/><arc tail="go" head="busy" kind="OUTPUT" mult="2"><point x="1" y="1"/></arc>
+<arc tail="busy" head="one" kind="INPUT"/><arc tail="one" head="idle" kind="OUTPUT"/>
+<arc tail="busy" head="now" kind="INPUT"/><arc tail="now" head="idle" kind="OUTPUT"/><arc tail="idle" head="now" kind="INHIBITOR"/>
+</edges></gspn></project>"""
+
+
+def test_greatspn_projects_give_rates_under_the_name_of_delays() -> None:
+    model = parse_pnpro(PNPRO)
+    assert model.gspn is not None and model.net == model.gspn.net
+    assert model.gspn.rate == (2.5, 0.25, None) and model.gspn.servers[:2] == (None, 1) and model.gspn.weight[2] == 3.0
+    assert model.net.initial == (3, 0) and model.net.consume[0] == ((0, 2),) and model.net.inhibit[2] == ((0, 1),)
+    assert model.net.priority[0] == 0 < model.net.priority[2] and model.positions["idle"] == (1.5, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('type="IMM"', 'type="GEN"', "EXP and IMM"),
+        ('kind="INHIBITOR"', 'kind="RESET"', "kinds are"),
+        ('value="2*(1+0.25)"', 'value=""', "set a value"),
+        ('delay="mu"', 'delay="nu"', "has no value"),
+        ('delay="mu"', 'delay="__import__(1)"', "has no value"),
+        ('name="busy" x', 'name="busy" domain="C" x', "coloured"),
+        ("<text-box", "<fluid", "unknown meaning"),
+    ],
+)
+def test_greatspn_features_that_we_lack_are_refused(old: str, new: str, said: str) -> None:
+    text = PNPRO.replace(old, new).replace("</text-box>", "</fluid>" if new == "<fluid" else "</text-box>")
+    with pytest.raises(FormatError, match=said):
+        parse_pnpro(text)
+
+
+TINA = r"""# a comment
+net {my net}
+tr t1 : go [0,w[ p*2 q?3 {r s}?-2 -> q {r s}
+tr t2 q -> p*2
+pl p : start (2) (1K)
+pl q (3)
+pr t1 > t2
+"""
+
+
+def test_tina_nets() -> None:
+    model = parse_tina(TINA)
+    assert model.net.places == ("p", "q", "r s") and model.net.initial == (1002, 3, 0)
+    assert model.net.consume[0] == ((0, 2), (1, 3)) and model.net.produce[0] == ((1, 4), (2, 1))
+    assert model.net.inhibit[0] == ((2, 2),) and model.net.priority == (1, 0)
+    assert model.labels == {"t1": "go", "p": "start"} and model.name == "my net"
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("tr t [1,2] p -> q", "time interval"),
+        ("tr t p q", "no ->"),
+        ("tr t p!2 -> q", "an arc 'p!2'"),
+        ("tr t p -> q?1", "an arc 'q\\?1'"),
+        ("zz t", "begins with 'zz'"),
+        ("pl p 3", "behind a place"),
+    ],
+)
+def test_tina_lines_that_cannot_be_read(line: str, said: str) -> None:
+    with pytest.raises(FormatError, match=said):
+        parse_tina(line, "x.net")
+
+
+def test_priorities_that_are_no_levels_are_refused() -> None:
+    with pytest.raises(FormatError, match="between some pairs only"):
+        parse_tina("tr a p -> p\ntr b p -> p\ntr c p -> p\npr a > b\n")
+
+
+@settings(max_examples=40, deadline=None)
+@given(nets(capacities=False))
+def test_tina_round_trip_of_any_net(net: Net) -> None:
+    again = parse_tina(write_tina(NetFile(net))).net
+    assert (again.initial, again.consume, again.produce, again.inhibit) == _in_order(net, again)
+    levels = {p: i for i, p in enumerate(sorted(set(net.priority)))}
+    assert again.priority == tuple(levels[p] for p in net.priority)
+
+
+def _in_order(net: Net, other: Net) -> tuple[object, ...]:
+    """The parts of a net with its places in another net's order."""
+    number = {p: other.place_index[name] for p, name in enumerate(net.places)}
+    arcs = [
+        tuple(tuple(sorted((number[p], w) for p, w in a)) for a in table)
+        for table in (net.consume, net.produce, net.inhibit)
+    ]
+    initial = tuple(net.initial[net.place_index[name]] for name in other.places)
+    return (initial, *arcs)
+
+
+@settings(max_examples=40, deadline=None)
+@given(nets(priorities=False, inhibitors=False))
+def test_capacities_survive_as_inhibitors(net: Net) -> None:
+    try:
+        again = parse_tina(write_tina(NetFile(net))).net
+    except FormatError:
+        return
+    one, two = (explore(n, limits=Limits(states=200)) for n in (net, again))
+    assert len(one) == len(two) and one.edges == two.edges
+
+
+def test_files_are_chosen_by_their_ending(tmp_path: Path) -> None:
+    gspn = Gspn.of(queue(3), {"arrive": 1.0, "serve": 2.0})
+    model = NetFile(gspn.net, "queue", gspn)
+    for ending in (".pnml", ".net"):
+        text, lost = written(model, ending)
+        path = tmp_path / f"queue{ending}"
+        path.write_text(text, encoding="utf-8")
+        assert explore(read_net(path).net).edges == 6
+        assert any("rates" in note for note in lost)
+    for path, said in ((tmp_path / "a.txt", "ending"), (tmp_path / "missing.pnml", "No such file")):
+        with pytest.raises(FormatError, match=said):
+            read_net(path)
+    with pytest.raises(FormatError, match="no writer"):
+        written(model, ".xyz")
+    with pytest.raises(FormatError, match="give rates"):
+        written(NetFile(gspn.net), ".drn")
+
+
+def test_losses_are_listed() -> None:
+    net = Net.build({"p": 1}, {"t": ({"p": 1}, {})}, inhibitors={"t": {"p": 2}}, capacity={"p": 3})
+    assert len(losses(NetFile(net))) == 2
+    assert write_tina(NetFile(net)) and "?-2" in write_tina(NetFile(net))
+
+
+def test_dot_and_drn() -> None:
+    gspn = Gspn.of(kanban(1), KANBAN_RATES)
+    dot, _ = written(NetFile(gspn.net, 'a "net"', gspn), ".dot")
+    assert dot.count("->") == sum(map(len, (*gspn.net.consume, *gspn.net.produce))) and r"\"net\"" in dot
+    drn, _ = written(NetFile(gspn.net, gspn=gspn), ".drn")
+    assert "@nr_states\n160\n" in drn and drn.count("\taction 0") == 160
+    rates = [float(line.split(":")[1]) for line in drn.splitlines() if line.startswith("\t\t")]
+    chain = Chain.of(gspn)
+    assert sum(rates) == pytest.approx(float(chain.amount.sum()))
+
+
+def test_a_net_without_namespace_stays_readable_xml() -> None:
+    text = write_pnml(parse_pnml(arc_file("")))
+    assert ElementTree.fromstring(text).tag == "pnml" and "ns0" not in write_pnml(parse_pnml(ISO))
+
+
+# Independent readers, where they are installed (`pip install petrobot[oracles]`).
+
+
+def test_pm4py_reads_what_we_write(tmp_path: Path) -> None:
+    pm4py = pytest.importorskip("pm4py")
+    path = tmp_path / "kanban.pnml"
+    path.write_text(write_pnml(NetFile(kanban(2))), encoding="utf-8")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        net, initial, _ = pm4py.read_pnml(str(path), auto_guess_final_marking=False)
+    assert len(net.places) == 16 and len(net.arcs) == sum(map(len, (*kanban(2).consume, *kanban(2).produce)))
+    assert sorted(initial.values()) == [2, 2, 2, 2]
+
+
+def test_storm_reads_what_we_write_and_agrees(tmp_path: Path) -> None:
+    stormpy = pytest.importorskip("stormpy")
+    gspn = Gspn.of(kanban(1), KANBAN_RATES)
+    path = tmp_path / "kanban.drn"
+    path.write_text(written(NetFile(gspn.net, gspn=gspn), ".drn")[0], encoding="utf-8")
+    model = stormpy.build_model_from_drn(str(path))
+    (formula,) = stormpy.parse_properties('LRA=? [ "pkan1" ]')
+    found = stormpy.model_checking(model, formula).get_value(0)
+    assert long_run(Chain.of(gspn)).occupancy["pkan1"] == pytest.approx(found, abs=1e-5)
