@@ -59,7 +59,18 @@ def _shared(task: Task, t: Transition, u: Transition) -> set[str]:
     """What both take: places of shared tokens, latched events, raised events."""
     shared = {a.place for a in t.inputs for b in u.inputs if a.place == b.place and _same_token(task, t, a, u, b)}
     common = [task.events[e] for e in t.events if e in u.events]
-    return shared | {f"the event {e.name}" for e in common if not is_pulse(e)} | _mutual_bars(t, u)
+    events = {f"the event {e.name}" for e in common if not is_pulse(e)}
+    return shared | events | _mutual_bars(t, u) | (_room(task, t) & _room(task, u))
+
+
+def _room(task: Task, t: Transition) -> set[str]:
+    """The room that the transition takes up in places of limited capacity."""
+    net = task.net
+    index = net.transition_index[t.name]
+    taken = dict(net.consume[index])
+    return {
+        f"room in {net.places[p]}" for p, w in net.produce[index] if net.capacity[p] is not None and w > taken.get(p, 0)
+    }
 
 
 def _same_token(task: Task, t: Transition, a: Input, u: Transition, b: Input) -> bool:

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from coordinator.check import check
 from coordinator.conditions import parse
 from coordinator.engine import (
     Abort,
@@ -33,6 +34,7 @@ from coordinator.engine import (
     Policy,
     RaiseEvent,
     RemoveTokens,
+    Report,
     Resume,
     RunEnded,
     RunHeld,
@@ -296,6 +298,36 @@ def play_anything(task: Task, data: st.DataObject) -> None:
     for _ in range(data.draw(st.integers(0, 25))):
         possible = journal.stimuli() if data.draw(st.integers(0, 4)) else journal.commands()
         journal.feed(data.draw(st.sampled_from(possible)))
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(tasks(), st.data())
+def test_what_check_calls_settled_is_never_left_undecided(task: Task, data: st.DataObject) -> None:
+    play_without_operator(task, data)
+
+
+@pytest.mark.proof
+@settings(max_examples=5000, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(tasks(), st.data())
+def test_what_check_calls_settled_is_never_left_undecided_at_length(task: Task, data: st.DataObject) -> None:
+    play_without_operator(task, data)
+
+
+def play_without_operator(task: Task, data: st.DataObject) -> None:
+    """Stimuli of the world alone: whoever pauses a net lets stimuli gather that never come together by themselves."""
+    unsettled = any(f.code == "unsettled-conflict" for f in check(task).findings)
+    engine = Engine(task, DEVICES, Policy(firing_limit=40))
+    journal = Journal(task)
+    state, instructions = engine.handle(engine.initial(), Begin({}, {"n": 1}))
+    for _ in range(data.draw(st.integers(0, 20))):
+        if not unsettled:
+            assert not [i for i in instructions if isinstance(i, Report) and i.key == "undecided"]
+        journal.state = state
+        journal.open |= {i.key: i for i in instructions if isinstance(i, Choose)}
+        journal.timers += [i.key for i in instructions if isinstance(i, ArmTimer)]
+        world: list[Stimulus] = [VariableChanged("b", True), VariableChanged("b", False), VariableChanged("n", 1)]
+        stimulus = data.draw(st.sampled_from(journal.stimuli() + world))
+        state, instructions = engine.handle(state, stimulus)
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])

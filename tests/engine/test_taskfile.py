@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
+from coordinator.check import check
 from coordinator.task import Counts, End, Inhibitor, Input, Output
 from coordinator.taskfile import TaskFileError, dumps, load, loads
 from coordinator.taskfile.arcs import ArcError, read_input, read_output, write_arc
@@ -319,3 +321,9 @@ def test_faults_of_subnets(old: str, new: str, words: str) -> None:
     assert old in SUBNET
     with pytest.raises(TaskFileError, match=words):
         loads(SUBNET.replace(old, new, 1))
+
+
+def test_example_of_the_documentation_is_a_sound_task() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "task-file.md").read_text(encoding="utf-8")
+    example = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)[0]
+    assert check(loads(example)).findings == ()
