@@ -119,7 +119,8 @@ export function svgOf(view) {
   const theme = document.documentElement.dataset.theme;
   document.documentElement.dataset.theme = "light";
   const clone = view.svg.cloneNode(true);
-  const [from, to] = [view.svg.querySelectorAll("*"), clone.querySelectorAll("*")];
+  clone.append(...view.moving.cloneNode(true).children);
+  const [from, to] = [[...view.svg.querySelectorAll("*"), ...view.moving.querySelectorAll("*")], clone.querySelectorAll("*")];
   from.forEach((node, i) => {
     const style = getComputedStyle(node);
     for (const key of DRAWN) {
@@ -137,7 +138,7 @@ export function svgOf(view) {
   clone.setAttribute("width", Math.round(w));
   clone.setAttribute("height", Math.round(tall));
   for (const node of clone.querySelectorAll("[display=none]")) node.remove();
-  clone.querySelector("g").removeAttribute("transform");
+  for (const world of clone.children) if (world.tagName === "g") world.removeAttribute("transform");
   return new XMLSerializer().serializeToString(clone);
 }
 

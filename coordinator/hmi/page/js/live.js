@@ -11,11 +11,12 @@ import { alarmed, sheetOf, tokensOf } from "./sheet.js";
 import { Timeline } from "./timeline.js";
 
 const FIRINGS_SHOWN = 25;
+const FIRINGS_MS = 240;
 const STATUS_ICON = { success: "check", failure: "warning", error: "error" };
 
 export class Live {
   constructor(link, operator) {
-    Object.assign(this, { link, operator, inside: "" });
+    Object.assign(this, { link, operator, inside: "", stale: new Set() });
     this.canvas = new Canvas("Task net", {
       chosen: (element) => this.choose(element.name),
       opened: (element) => element.kind === "macro" && this.open(element.name),
@@ -80,18 +81,30 @@ export class Live {
     for (const change of changes) if (change.kind === "fired") this.fired(change.firing);
     if (all || changed.has("marking") || changed.has("firings")) this.paintTokens();
     if (all || changed.has("runs")) this.paintRuns();
-    if (all || changed.has("firings") || changed.has("breakpoints") || changed.has("marking")) this.paintMarks();
-    if (all || changed.has("firings")) this.paintFirings();
-    if (all || changed.has("nodes")) this.paintNodes();
-    if (all || changed.has("selectors")) this.paintSelectors();
-    if (all || changed.has("result") || changed.has("mission")) this.paintResult();
     this.view.flights.freeze(Boolean(this.link.state.paused));
-    if (all || ["marking", "runs", "breakpoints", "events", "controls", "firings", "connection"].some((p) => changed.has(p))) this.selected.update(this.link.state, this.link.now());
+    for (const part of changed) this.stale.add(part);
+    if (all || changed.has("paused") || changed.has("controls")) this.paintText();
+  }
+
+  /** Lists and text: nobody reads them faster than ten times a second, and laying out text is what costs most. */
+  paintText() {
+    const changed = this.stale;
+    if (!changed.size) return;
+    this.stale = new Set();
+    const dirty = (...parts) => changed.has("all") || parts.some((part) => changed.has(part));
+    if (dirty("firings", "breakpoints", "marking")) this.paintMarks();
+    if (dirty("runs")) this.paintCards();
+    if (dirty("firings")) this.paintFirings(changed.has("all"));
+    if (dirty("nodes")) this.paintNodes();
+    if (dirty("selectors")) this.paintSelectors();
+    if (dirty("result", "mission")) this.paintResult();
+    if (dirty("marking", "runs", "breakpoints", "events", "controls", "firings", "connection")) this.selected.update(this.link.state, this.link.now());
     this.dock.paint(changed);
   }
 
   /** Called a few times a second for what moves with the clock. */
   tick(now) {
+    this.paintText();
     this.paintClocks(now);
     this.dock.tick(now);
   }
@@ -127,7 +140,10 @@ export class Live {
     const byPlace = new Map();
     for (const run of Object.values(runs)) byPlace.set(run.place, run);
     for (const element of this.view.elements.values()) if (element.kind === "action") this.view.run(element.name, byPlace.get(element.name));
-    const list = Object.values(runs);
+  }
+
+  paintCards() {
+    const list = Object.values(this.link.state.runs);
     this.running.count(list.length || "");
     rows(this.running.content, list, (run) => run.id, (run) => this.runCard(run), (node, run) => this.updateCard(node, run));
     if (!list.length) this.running.content.dataset.empty = "Nothing runs.";
@@ -179,12 +195,16 @@ export class Live {
     if (task) this.view.alarm(alarmed(task, marking, firings.map((f) => f.transition)));
   }
 
-  paintFirings() {
+  paintFirings(now = true) {
+    // each new row shifts all others: a busy net is read at four lists a second
+    if (!now && performance.now() - (this.firingsAt ?? 0) < FIRINGS_MS) return this.stale.add("firings");
+    this.firingsAt = performance.now();
     const list = this.link.state.firings.slice(-FIRINGS_SHOWN).reverse();
     this.firings.count(this.link.state.mission.firings ?? "");
     rows(this.firings.content, list, (f) => f.number, (f) => this.firingRow(f));
     if (!list.length) this.firings.content.dataset.empty = "Nothing has fired yet.";
     else delete this.firings.content.dataset.empty;
+    return null;
   }
 
   firingRow(firing) {

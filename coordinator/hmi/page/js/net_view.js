@@ -8,6 +8,7 @@ import { iconPath } from "./icons.js";
 const KIND_WORD = { action: "Action place", resource: "Resource place", control: "Control place", macro: "Macro place" };
 const LABEL_MOST = 24;
 const ZOOM = [0.12, 3];
+const FLASH_MS = 550;
 
 const short = (label) => (label.length > LABEL_MOST ? `${label.slice(0, LABEL_MOST - 1)}…` : label);
 
@@ -22,11 +23,14 @@ export class NetView {
     this.arcs = new Map();
     this.folded = true;
     this.view = { x: 0, y: 0, zoom: 1 };
-    this.layers = Object.fromEntries(["frames", "arcs", "nodes", "flights", "over"].map((n) => [n, s("g", { class: n })]));
-    this.world = s("g", { class: "world" }, Object.values(this.layers));
-    this.svg = s("svg", { class: "net", role: "application", "aria-label": label, tabindex: "0" }, this.defs(), this.world);
-    this.flights = new Flights(this.layers.flights, (name) => this.landed(name));
-    host.append(this.svg);
+    this.layers = Object.fromEntries(["arcs", "nodes", "over", "live", "flights"].map((n) => [n, s("g", { class: n })]));
+    const { arcs, nodes, over, live, flights } = this.layers;
+    this.worlds = [[arcs, nodes, over], [live], [flights]].map((layers) => s("g", { class: "world" }, layers));
+    this.svg = s("svg", { class: "net", role: "application", "aria-label": label, tabindex: "0" }, this.defs(), this.worlds[0]);
+    // what changes many times a second lies in drawings of its own: the browser then need not lay out 300 elements each time
+    [this.moving, this.flying] = this.worlds.slice(1).map((world) => s("svg", { class: "net moving", "aria-hidden": "true" }, world));
+    this.flights = new Flights(flights, (arc) => this.landed(arc));
+    host.append(this.svg, this.moving, this.flying);
     this.host = host;
     this.pointers();
     new ResizeObserver(() => this.resized()).observe(host);
@@ -49,6 +53,7 @@ export class NetView {
     for (const [name, element] of this.elements) {
       if (!wanted.has(name) || wanted.get(name).shape !== element.shape || wanted.get(name).kind !== element.kind) {
         element.node.remove();
+        element.live.remove();
         this.elements.delete(name);
       }
     }
@@ -62,7 +67,9 @@ export class NetView {
     if (!element) {
       element = { tokens: 0, incoming: 0, ...given };
       element.node = given.shape === "place" ? this.placeNode(element) : this.transitionNode(element);
+      element.live = s("g", { class: `live-part ${element.kind ?? "transition"}` }, element.parts.tint, element.parts.progress, element.parts.tokens);
       this.layers.nodes.append(element.node);
+      this.layers.live.append(element.live);
       this.elements.set(name, element);
     }
     const moved = element.x !== given.x || element.y !== given.y || !element.drawn;
@@ -73,7 +80,9 @@ export class NetView {
   }
 
   put(element) {
-    element.node.setAttribute("transform", `translate(${element.x} ${element.y})`);
+    const where = `translate(${element.x} ${element.y})`;
+    element.node.setAttribute("transform", where);
+    element.live.setAttribute("transform", where);
   }
 
   placeNode(element) {
@@ -81,14 +90,19 @@ export class NetView {
       body: s("circle", { class: "body", r: PLACE_R }),
       inner: element.kind === "control" ? s("circle", { class: "inner", r: PLACE_R - 4.5 }) : null,
       square: element.kind === "macro" ? s("rect", { class: "inner", x: -13, y: -13, width: 26, height: 26, rx: 4 }) : null,
-      progress: element.kind === "action" ? s("circle", { class: "progress", r: PLACE_R + 4, pathLength: 100, transform: "rotate(-90)" }) : null,
-      tokens: s("g", { class: "tokens" }),
       label: s("text", { class: "label", y: PLACE_R + 18 }),
       sub: s("text", { class: "sub", y: PLACE_R + 32 }),
       marks: s("g", { class: "marks" }),
     };
-    element.parts = parts;
-    return this.wire(element, s("g", { class: `element place ${element.kind}` }, Object.values(parts)));
+    const node = s("g", { class: `element place ${element.kind}` }, Object.values(parts));
+    const isAction = element.kind === "action";
+    element.parts = {
+      ...parts,
+      tint: isAction ? s("circle", { class: "tint", r: PLACE_R - 1 }) : "",
+      progress: isAction ? s("circle", { class: "progress", r: PLACE_R + 4, pathLength: 100, transform: "rotate(-90)" }) : "",
+      tokens: s("g", { class: "tokens" }),
+    };
+    return this.wire(element, node);
   }
 
   transitionNode(element) {
@@ -99,7 +113,7 @@ export class NetView {
       sub: s("text", { class: "sub", y: -BAR_H / 2 - 9 }),
       marks: s("g", { class: "marks" }),
     };
-    element.parts = parts;
+    element.parts = { ...parts, tint: "", progress: "", tokens: "" };
     return this.wire(element, s("g", { class: "element transition" }, Object.values(parts)));
   }
 
@@ -232,7 +246,7 @@ export class NetView {
 
   hideFolded() {
     const badges = new Map();
-    for (const element of this.elements.values()) attribute(element.node, "display", this.isFolded(element) ? "none" : null);
+    for (const element of this.elements.values()) for (const part of [element.node, element.live]) attribute(part, "display", this.isFolded(element) ? "none" : null);
     for (const arc of this.arcs.values()) {
       const [place, transition] = [this.elements.get(arc.place), this.elements.get(arc.transition)];
       const hidden = this.isFolded(place) || this.isFolded(transition);
@@ -290,7 +304,6 @@ export class NetView {
     element.parts.tokens.replaceChildren(
       ...(places ? places.map(([x, y]) => s("circle", { class: "token", cx: x, cy: y, r: 5 })) : [s("text", { class: "count", y: 6 }, String(shown))]),
     );
-    attribute(element.node, "data-tokens", shown || null);
   }
 
   /** Let tokens fly along the arcs of a firing, and light its transition. */
@@ -315,17 +328,18 @@ export class NetView {
   }
 
   flash(element, failed) {
-    element.node.classList.remove("fired", "failed");
-    element.node.getBoundingClientRect && requestAnimationFrame(() => element.node.classList.add(failed ? "failed" : "fired"));
+    element.flash ??= element.shape === "place" ? s("circle", { r: PLACE_R }) : s("rect", { x: -BAR_W / 2, y: -BAR_H / 2, width: BAR_W, height: BAR_H, rx: 3 });
+    attribute(element.flash, "class", `flash ${element.shape} ${failed ? "failed" : ""}`);
+    if (!element.flash.parentNode) element.live.prepend(element.flash);
     clearTimeout(element.flashTimer);
-    element.flashTimer = setTimeout(() => element.node.classList.remove("fired", "failed"), 650);
+    element.flashTimer = setTimeout(() => element.flash.remove(), FLASH_MS);
   }
 
   /** How far the run in an action place is: {state, progress} or null for none. */
   run(name, run) {
     const element = this.elements.get(name);
     if (!element?.parts.progress) return;
-    attribute(element.node, "data-run", run ? run.state || "running" : null);
+    attribute(element.live, "data-run", run ? run.state || "running" : null);
     const part = run ? Math.round(Math.max(0.02, run.progress ?? 0) * 100) : 0;
     attribute(element.parts.progress, "stroke-dasharray", run ? `${part} 100` : null);
     if (element.state !== (run?.state ?? "")) {
@@ -370,7 +384,7 @@ export class NetView {
 
   look(x, y, zoom) {
     this.view = { x, y, zoom: Math.max(ZOOM[0], Math.min(ZOOM[1], zoom)) };
-    this.world.setAttribute("transform", `translate(${x.toFixed(1)} ${y.toFixed(1)}) scale(${this.view.zoom.toFixed(4)})`);
+    for (const world of this.worlds) world.setAttribute("transform", `translate(${x.toFixed(1)} ${y.toFixed(1)}) scale(${this.view.zoom.toFixed(4)})`);
     this.svg.classList.toggle("far", this.view.zoom < 0.45);
     this.events.moved?.(this);
   }

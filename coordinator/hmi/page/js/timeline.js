@@ -3,6 +3,7 @@
 import { h, seconds, text, words } from "./dom.js";
 
 let [LANE, LEFT, HEAD] = [24, 150, 20]; // px at the usual type size; all grow with the type of a wall screen
+const LANES_AT_MOST = 12;
 const STEPS = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1800, 3600];
 
 export class Timeline {
@@ -17,19 +18,35 @@ export class Timeline {
     this.canvas.addEventListener("pointermove", (event) => this.hover(event));
     this.canvas.addEventListener("pointerleave", () => (this.tip.hidden = true));
     this.canvas.addEventListener("click", (event) => this.under(event) && this.chosen?.(this.under(event).run.place));
-    new ResizeObserver(() => this.draw()).observe(this.root);
+    new ResizeObserver(([entry]) => this.sized(entry.contentRect.width)).observe(this.root);
   }
 
+  /** Sizes and colours are read when they change, not at each drawing: reading them makes the browser lay out first. */
+  sized(width) {
+    this.width = width;
+    this.em = width ? parseFloat(getComputedStyle(this.root).fontSize) / 14 : 1;
+    [LANE, LEFT, HEAD] = [24 * this.em, 150 * this.em, 20 * this.em];
+    this.draw();
+  }
+
+  colour(name) {
+    const { theme } = document.documentElement.dataset;
+    if (this.theme !== theme) [this.theme, this.colours] = [theme, new Map()];
+    if (!this.colours.has(name)) this.colours.set(name, getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim());
+    return this.colours.get(name);
+  }
+
+  /** Lanes are the action places; of many, only those that have had runs are shown. */
   set(lanes, ended, going, now) {
-    Object.assign(this, { lanes, ended, going, now });
+    const used = new Set([...ended, ...going].map((run) => run.place));
+    const shown = lanes.length > LANES_AT_MOST ? lanes.filter((lane) => used.has(lane.name)).slice(0, 2 * LANES_AT_MOST) : lanes;
+    Object.assign(this, { lanes: shown, ended, going, now });
     this.draw();
   }
 
   draw() {
-    const width = this.root.clientWidth;
-    this.em = parseFloat(getComputedStyle(this.root).fontSize) / 14;
-    [LANE, LEFT, HEAD] = [24 * this.em, 150 * this.em, 20 * this.em];
-    if (!this.lanes || !width || !this.root.offsetParent) return;
+    const { width } = this;
+    if (!this.lanes || !width) return;
     const height = HEAD + Math.max(1, this.lanes.length) * LANE + 4;
     const ratio = devicePixelRatio || 1;
     if (this.canvas.width !== Math.round(width * ratio) || this.canvas.height !== Math.round(height * ratio)) {
@@ -41,8 +58,6 @@ export class Timeline {
     const pen = this.canvas.getContext("2d");
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
     pen.clearRect(0, 0, width, height);
-    const css = getComputedStyle(document.documentElement);
-    this.colour = (name) => css.getPropertyValue(`--${name}`).trim();
     const chosen = Number(this.span.value);
     const first = Math.min(...this.ended.map((r) => r.started), ...this.going.map((r) => r.started), this.now);
     const from = chosen ? Math.max(0, this.now - chosen) : Math.max(0, first);
