@@ -16,7 +16,7 @@ class DigitalInputs(CanopenNode):
     """Arm-power chain closed."""
 
     def __init__(self, node: int) -> None:
-        super().__init__(node, "cell_inputs.eds")
+        super().__init__(node, "digital_inputs.eds")
         self.inputs = self.POWER
         self._sent = -1
         self._due = 0.0

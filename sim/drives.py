@@ -85,7 +85,7 @@ class Drive(CanopenNode):
     """One drive: CiA 402 state machine in cyclic synchronous position mode around a `JointServo`."""
 
     def __init__(self, joint: int, rating: DriveRating, plant: Plant) -> None:
-        super().__init__(joint + 1, "puma_drive.eds")
+        super().__init__(joint + 1, "joint_drive.eds")
         self.joint = joint
         self.plant = plant
         self.servo = JointServo(rating, plant.q[joint])

@@ -21,8 +21,8 @@ from sim.drives import DriveBus, ratings
 
 canopen: Any = importlib.import_module("canopen")  # it has no annotations worth the name
 BaseNode402: Any = importlib.import_module("canopen.profiles.p402").BaseNode402
-EDS = str(files("services.comm.eds").joinpath("puma_drive.eds"))
-INPUTS_EDS = str(files("services.comm.eds").joinpath("cell_inputs.eds"))
+EDS = str(files("services.comm.eds").joinpath("joint_drive.eds"))
+INPUTS_EDS = str(files("services.comm.eds").joinpath("digital_inputs.eds"))
 PATIENCE = 10.0
 
 
