@@ -11,11 +11,16 @@ from typing import Any
 
 import pytest
 import pytest_asyncio
+from hypothesis import Phase, given, settings
 
+from coordinator.hmi.changes import apply, empty_state
 from coordinator.hmi.server import Page, start_page
 from coordinator.task import Executed, Status
+from coordinator.taskfile import load
+from tests.bench.hmi import SyntheticMission, ticking
 from tests.hmi.conftest import ARGUMENTS, BROWSER, browser_missing, served, staged
 from tests.hmi.stage import Part, Stage
+from tests.hmi.test_changes import changes
 
 if browser_missing() and os.environ.get("CI") != "true":
     pytest.skip(browser_missing(), allow_module_level=True)
@@ -407,3 +412,208 @@ async def test_history(browser: Browser, page: Page, stage: Stage, shots: Path, 
     assert (verb, data["mode"], data["from"]["run"]) == ("start", "simulated", "pick_and_place-2")
     assert data["marking"]["clear"] == 1
     assert complaints == []
+
+
+# ---- drawing without a mouse, conflicts, formats ----------------------------------------------------------------------
+
+
+async def designer(browser: Browser, page: Page) -> Tab:
+    """The designer with the shipped task open."""
+    tab = await opened(browser, page)
+    await tab.get_by_role("tab", name="Design").click()
+    await expect(tab.get_by_role("region", name="Findings")).to_contain_text("May run")
+    return tab
+
+
+async def test_drawing_by_keyboard_alone(browser: Browser, page: Page, faults: Watch) -> None:
+    """Places, transitions and arcs, names, undo and redo, copy, move and delete: no mouse, and Escape destroys nothing."""
+    tab = await designer(browser, page)
+    complaints = faults(tab)
+    await tab.get_by_role("button", name="New task").press("Enter")
+    for kind, name in (("Control place", "jobs"), ("Transition", "begin"), ("Action place", "work")):
+        await tab.get_by_role("toolbar", name="Drawing tools").get_by_role("button", name=kind).press("Enter")
+        await tab.keyboard.press("Enter")
+        await tab.keyboard.press("Control+a")
+        await tab.keyboard.type(name)
+        await tab.keyboard.press("Enter")
+        await expect(element(tab, f"^{kind} {name}")).to_be_visible()
+    drawing = tab.get_by_role("application", name="Drawing of the task")
+    for start, target in (("jobs", "begin"), ("begin", "work")):
+        await select_by_keyboard(tab, start)
+        await tab.keyboard.press("a")
+        await select_by_keyboard(tab, target)
+        await tab.keyboard.press("Enter")
+        await expect(drawing.get_by_role("button", name=f"Arc from {start} to {target}")).to_have_count(1)
+    await select_by_keyboard(tab, "work")
+    before = await element(tab, "^Action place work").get_attribute("transform")
+    await tab.keyboard.press("ArrowRight")
+    assert await element(tab, "^Action place work").get_attribute("transform") != before
+    await tab.keyboard.press("Control+z")
+    assert await element(tab, "^Action place work").get_attribute("transform") == before
+    await tab.keyboard.press("Control+a")
+    await tab.keyboard.press("Control+c")
+    await tab.keyboard.press("Control+v")
+    await expect(element(tab, "^Action place work_2")).to_be_visible()
+    await expect(drawing.get_by_role("button", name="Arc from begin_2 to work_2")).to_have_count(1)
+    await tab.keyboard.press("Delete")
+    await expect(element(tab, "^Action place work_2")).to_be_hidden()
+    await tab.keyboard.press("Control+z")
+    await expect(element(tab, "^Action place work_2")).to_be_visible()
+    await tab.keyboard.press("Escape")
+    await expect(element(tab, "^Action place work_2")).to_be_visible()
+    await tab.keyboard.press("?")
+    await expect(tab.get_by_role("dialog", name="Keyboard")).to_be_visible()
+    assert complaints == []
+
+
+async def select_by_keyboard(tab: Tab, name: str) -> None:
+    """Go through the elements until the one of this name is selected."""
+    properties = tab.get_by_role("complementary", name="Properties")
+    for _ in range(12):
+        await tab.keyboard.press("]")
+        field = properties.get_by_label("Name", exact=True)
+        if await field.count() and await field.input_value() == name:
+            return
+    raise AssertionError(f"{name} was not reached")
+
+
+async def test_what_may_not_be_drawn_says_why(browser: Browser, page: Page) -> None:
+    """An arc between two places is refused; a missing branch and an action that no node offers are shown where they are."""
+    tab = await designer(browser, page)
+    await tab.get_by_role("toolbar", name="Drawing tools").get_by_role("button", name="Arc", exact=True).click()
+    await element(tab, "^Action place look").click()
+    await element(tab, "^Action place pick").click()
+    await expect(tab.get_by_text("never two places")).to_be_visible()
+    await tab.keyboard.press("Escape")
+    await element(tab, "^Transition pick_failed").click()
+    await tab.keyboard.press("Delete")
+    findings = tab.get_by_role("region", name="Findings")
+    await expect(findings).to_contain_text("fault")
+    await findings.get_by_role("button", name=re.compile("^pick")).first.click()
+    properties = tab.get_by_role("complementary", name="Properties")
+    await expect(properties.get_by_label("Name", exact=True)).to_have_value("pick")
+    await tab.get_by_role("button", name="Undo").click()
+    await expect(findings).to_contain_text("May run")
+    await tab.get_by_role("searchbox", name="Find a place or transition").fill("clear")
+    await tab.keyboard.press("Enter")
+    await expect(properties.get_by_label("Name", exact=True)).to_have_value(re.compile("clear"))
+
+
+async def test_two_people_edit_one_task(browser: Browser, page: Page, tasks: Path) -> None:
+    """The later save is refused, both versions are shown, and nothing is lost whatever one chooses."""
+    ana, ben = await designer(browser, page), await designer(browser, page)
+    for tab, goal in ((ana, "from ana"), (ben, "from ben")):
+        field = tab.get_by_label("Goal", exact=True)
+        await field.fill(goal)
+        await field.press("Enter")
+        await tab.get_by_role("button", name="Save").click()
+        if goal == "from ana":
+            await expect(tab.get_by_role("status").filter(has_text=re.compile("^saved$"))).to_be_visible()
+    conflict = ben.get_by_role("dialog", name="Conflict")
+    await expect(conflict).to_contain_text('goal = "from ana"')
+    await expect(conflict).to_contain_text('goal = "from ben"')
+    assert load(tasks / "pick_and_place.toml").goal == "from ana"
+    await conflict.get_by_role("button", name="Replace theirs by mine").click()
+    await expect(conflict).to_be_hidden()
+    await expect(ben.get_by_role("status").filter(has_text=re.compile("^saved$"))).to_be_visible()
+    assert load(tasks / "pick_and_place.toml").goal == "from ben"
+
+
+async def test_formats_and_layout(browser: Browser, page: Page, tasks: Path, tmp_path: Path) -> None:
+    """SVG stands on its own, PNG and PNML come out, PNML comes back, and the layout button moves things as one step."""
+    tab = await designer(browser, page)
+    made = {}
+    for form in ("SVG", "PNG", "PNML", "TOML"):
+        async with tab.expect_download() as waiting:
+            await tab.get_by_label("Import and export").select_option(f"Export {form}")
+        download = await waiting.value
+        made[form] = tmp_path / download.suggested_filename
+        await download.save_as(made[form])
+    svg = made["SVG"].read_text()
+    assert svg.startswith("<svg") and "pick" in svg and "class=" not in svg and "var(--" not in svg
+    assert made["PNG"].read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" and made["PNG"].stat().st_size > 20_000
+    assert made["TOML"].read_text() == (tasks / "pick_and_place.toml").read_text()
+    await tab.get_by_label("File to import").set_input_files(made["PNML"])
+    await expect(element(tab, "^Control place pick,")).to_be_visible()
+    before = await element(tab, "^Control place pick,").get_attribute("transform")
+    await tab.get_by_role("button", name="Layout").click()
+    assert await element(tab, "^Control place pick,").get_attribute("transform") != before
+    await tab.get_by_role("button", name="Undo").click()
+    assert await element(tab, "^Control place pick,").get_attribute("transform") == before
+
+
+async def test_macro_places_open_in_both_views(browser: Browser, page: Page, stage: Stage, tasks: Path) -> None:
+    """A sub-net is drawn as one place, shows how many tokens are inside, and opens on demand."""
+    text = (tasks / "pick_and_place.toml").read_text()
+    inner = (
+        '\n[subnets.fetching]\nentry = "inside"\nnormal = "handed"\n'
+        '[subnets.fetching.places.inside]\nkind = "control"\nx = 80\ny = 100\n'
+        '[subnets.fetching.places.handed]\nkind = "control"\nx = 300\ny = 100\n'
+        '[subnets.fetching.transitions.pass_on]\nin = ["inside"]\nout = ["handed"]\nafter = 60.0\nx = 190\ny = 100\n'
+        '\n[places.fetch]\nkind = "macro"\nsubnet = "fetching"\nx = 120\ny = 440\n'
+        '[transitions.leave]\nin = ["fetch:normal"]\nout = ["arm_free"]\nx = 200\ny = 380\n'
+    )
+    (tasks / "nested.toml").write_text(text.replace('out = ["look"]', 'out = ["fetch"]') + inner)
+    stage.load(load(tasks / "nested.toml"), (tasks / "nested.toml").read_text())
+    tab = await opened(browser, page)
+    await tab.get_by_role("button", name="Take controls").click()
+    holder = stage.controls.holder
+    assert holder is not None
+    assert (await stage.command(holder, "start", {"task": "nested"}))["ok"]
+    stage.happen("part_there")
+    await expect(element(tab, "^Macro place fetch, 1 token", "Task net")).to_be_visible()
+    await element(tab, "^Macro place fetch", "Task net").click()
+    await tab.get_by_role("region", name="Selected").get_by_role("button", name="Open").click()
+    await expect(element(tab, "^Control place inside, 1 token", "Task net")).to_be_visible()
+    await tab.get_by_role("navigation", name="Opened macro places").get_by_role("button", name="pick and place").click()
+    await expect(element(tab, "^Macro place fetch", "Task net")).to_be_visible()
+    await tab.get_by_role("tab", name="Design").click()
+    await tab.get_by_label("Task", exact=True).select_option("nested")
+    await element(tab, "^Macro place fetch").click()
+    await tab.get_by_role("complementary", name="Properties").get_by_role("button", name="Open").click()
+    await expect(element(tab, "^Control place inside")).to_be_visible()
+
+
+# ---- the page's rules are the server's --------------------------------------------------------------------------------
+
+
+async def test_the_browser_applies_changes_as_the_server_does(browser: Browser, page: Page) -> None:
+    """The two copies of the rules, in Python and in the page, lead to one state on random runs of changes."""
+    tab = await opened(browser, page)
+    script = """async ([state, changes]) => {
+      const { apply } = await import("/page/js/state.js");
+      for (const change of changes) apply(state, change);
+      return state;
+    }"""
+    for made in some_changes():
+        here = empty_state()
+        for change in made:
+            apply(here, {k: v for k, v in change.items() if k not in ("sequence", "time")})
+        assert await tab.evaluate(script, [empty_state(), made]) == here
+
+
+def some_changes() -> list[list[dict[str, Any]]]:
+    """Thirty runs of changes, the same at each run of the test."""
+    found: list[list[dict[str, Any]]] = []
+
+    @settings(max_examples=30, database=None, derandomize=True, phases=[Phase.generate])
+    @given(changes())
+    def collect(made: list[dict[str, Any]]) -> None:
+        found.append(made)
+
+    collect()
+    return found
+
+
+async def test_fifty_updates_a_second_leave_no_gap(browser: Browser, page: Page, stage: Stage) -> None:
+    """A hundred nodes under steady fire: every number arrives, merged deltas only, and the page ends at the newest."""
+    tab = await opened(browser, page)
+    mission = SyntheticMission(100)
+    stage.feed.replace(**{k: v for k, v in mission.snapshot().items() if k != "sequence"})
+    await expect(element(tab, "^Transition step_49", "Task net")).to_be_visible()
+    mission.feed = stage.feed
+    await ticking(mission, 2.0)
+    last = str(stage.feed.state["sequence"])
+    await expect(tab.locator("html")).to_have_attribute("data-sequence", last)
+    assert await tab.evaluate("petrobot.link.gaps") == 0
+    assert await tab.evaluate("petrobot.link.deltas") > 10

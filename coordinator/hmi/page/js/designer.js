@@ -26,7 +26,7 @@ export class Designer {
     Object.assign(this, { link, operator, offers: [], findings: [], text: "", tool: "select" });
     this.selection = { names: new Set(), arc: null };
     this.pointer = new Pointer(this);
-    this.canvas = new Canvas("Drawing of the task", { down: (event) => this.pointer.down(event), chosen: (e, event) => this.pick(e.name, event), opened: (e) => this.opened(e), moved: () => this.canvas?.map.follow() });
+    this.canvas = new Canvas("Drawing of the task", { keyed: true, down: (event) => this.pointer.down(event), chosen: (e, event) => this.pick(e.name, event), opened: (e) => this.opened(e), moved: () => this.canvas?.map.follow() });
     this.canvas.view.fold(false);
     this.canvas.errors.setAttribute("aria-pressed", "true");
     this.keys = new Keys(this);

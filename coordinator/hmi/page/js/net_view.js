@@ -431,7 +431,7 @@ export class NetView {
       if (element) this.events.opened?.(element, event);
     });
     this.svg.addEventListener("keydown", (event) => {
-      if (event.key !== "Enter" && event.key !== " ") return;
+      if (this.events.keyed || (event.key !== "Enter" && event.key !== " ")) return;
       const element = this.elementAt(event.target);
       if (element && !event.defaultPrevented) {
         event.preventDefault();
