@@ -90,7 +90,7 @@ def lockstep_mission(directory: Directory, setting: Setting) -> Mission:
 def lockstep_party(directory: Directory, node: NodeEntry, substitutes: Substitutes | None = None) -> Party:
     """The party of a node: a laboratory's own, or a node with its drivers and actions inline."""
     if node.sim:
-        party: Party = load_object("sim.laboratory:make_laboratory")(directory, node.name)
+        party: Party = load_object(node.sim)(directory, node.name)
         return party
     return load_object(NODE_PARTY)(directory, node.name, substitutes=substitutes)  # type: ignore[no-any-return]
 

@@ -130,5 +130,5 @@ class LockstepPorts:
     def _laboratory(self) -> str:
         laboratory = self._directory.laboratory()
         if not laboratory:
-            raise ValueError("lock step needs a simulated node; write sim = true in one [nodes.NAME]")
+            raise ValueError('lock step needs a simulated node; write sim = "module:function" in one [nodes.NAME]')
         return laboratory

@@ -10,10 +10,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from services.comm.directory import Directory, DirectoryError, load
+from services.comm.directory import Directory, DirectoryError, load, resolve
 from services.comm.lockstep import CellError, Delays, Member
 from services.comm.security import KeyFileError, KeyNeededError, read_key
-from sim.laboratory import make_laboratory
 from sim.realtime import serve
 from sim.truth import LaboratoryError
 
@@ -24,7 +23,7 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     commands = argparse.ArgumentParser(
         prog="python -m sim",
-        description="Launches the simulated laboratory: the node of services.toml that says sim = true.",
+        description="Launches the simulated laboratory: the node of services.toml with a key sim.",
         epilog=f"{EXAMPLE}\n\nexit codes: 0 ended by SIGTERM, 2 bad services.toml or cell file, 3 the cell lost a party",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -41,13 +40,14 @@ def read(path: Path) -> tuple[Directory, str]:
         raise DirectoryError((f"{path}: {fault.strerror}; name the file with --services",)) from fault
     name = directory.laboratory()
     if not name:
-        raise DirectoryError((f"{path}: no node is simulated; write sim = true in one [nodes.NAME]",))
+        text = 'no node is simulated; write sim = "sim.laboratory:make_laboratory" in one [nodes.NAME]'
+        raise DirectoryError((f"{path}: {text}",))
     return directory, name
 
 
 def run_lockstep(directory: Directory, name: str) -> None:
     """Be a member of a lock-step cell of one process a node, until one of them ends it."""
-    laboratory = make_laboratory(directory, name)
+    laboratory = resolve(directory.nodes[name].sim)(directory, name)
     key = read_key(directory.file(directory.keys["file"])) if "file" in directory.keys else None
     delays = Delays(directory.delays())
     member = Member(name, [laboratory], directory.members(), delays=delays, directory=directory.hash, key=key)
@@ -69,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             run_lockstep(directory, name)
         else:
             asyncio.run(serve(directory, name))
-    except (DirectoryError, LaboratoryError, KeyNeededError, KeyFileError, ValueError, OSError) as fault:
+    except (DirectoryError, LaboratoryError, KeyNeededError, KeyFileError, ImportError, ValueError, OSError) as fault:
         print(f"python -m sim: {fault}", file=sys.stderr)
         return 2
     except CellError as fault:

@@ -30,12 +30,13 @@ class DirectoryError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class NodeEntry:
-    """A node: one process (with its workers) at one address. `sim` marks the simulated laboratory's."""
+    """A node: one process (with its workers) at one address."""
 
     name: str
     host: str
     port: int
-    sim: bool = False
+    sim: str = ""
+    """Import path of what makes the simulated laboratory's party, `function(directory, name)`; empty for a real node."""
     worker_memory_mb: int = 0
     """Limit of the address space of each worker process (MiB); 0: none."""
 

@@ -67,7 +67,7 @@ SHAPES: Mapping[str, Mapping[str, Key]] = {
         "port": Key(
             "a port from 1 to 65535", lambda v: isinstance(v, int) and not isinstance(v, bool) and 0 < v < 65536, True
         ),
-        "sim": Key("true or false", lambda v: isinstance(v, bool)),
+        "sim": _path_key("function"),
         "worker_memory_mb": Key(
             "a whole number of MiB above 0", lambda v: isinstance(v, int) and not isinstance(v, bool) and v > 0
         ),
@@ -238,11 +238,11 @@ def _check_places(tables: Tables, faults: Faults, memory: str) -> None:
             _check_node(f"{table}.{name}.node", entry["node"], nodes, faults)
     for name, entry in devices.items():
         node = nodes.get(entry["node"], {})
-        if "driver" not in entry and node and not node.get("sim", False):
+        if "driver" not in entry and node and not node.get("sim"):
             faults.add(f"devices.{name}.driver", 'is missing; write an import path "module:Class"')
     for name, entry in tables["services"].items():
         node = nodes.get(entry["node"], {})
-        if "run" not in entry and name != memory and node and not node.get("sim", False):
+        if "run" not in entry and name != memory and node and not node.get("sim"):
             faults.add(f"services.{name}.run", f'is missing; write an import path (only "{memory}" is built in)')
     for name, entry in tables["streams"].items():
         if entry["to"] not in devices:

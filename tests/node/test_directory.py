@@ -22,7 +22,7 @@ port = 7302
 [nodes.world]
 host = "127.0.0.1"
 port = 7300
-sim = true
+sim = "sim.laboratory:make_laboratory"
 [devices.eye]
 node = "vision"
 driver = "json:JSONDecoder"

@@ -32,7 +32,7 @@ port = 7402
 [nodes.world]
 host = "127.0.0.1"
 port = 7400
-sim = true
+sim = "sim.laboratory:make_laboratory"
 [devices.slide]
 node = "left"
 driver = "toy_cell.drivers:Slide"
