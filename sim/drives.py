@@ -29,8 +29,9 @@ from sim.servo import DriveRating, JointServo
 INPUTS_NODE: Final = 7
 """Node id of the digital inputs; the drives have 1 to 6, base to flange."""
 
-SYNC_PATIENCE: Final = 3
-"""Periods of 1006h without SYNC after which an enabled drive stops by itself."""
+SYNC_PATIENCE: Final = 10
+"""Periods of 1006h without SYNC after which an enabled drive stops by itself: 40 ms at 250 Hz, shorter than three periods of
+the set-point stream, longer than what a master on an ordinary Linux is now and then late."""
 
 _REGISTERS: Final = {
     Fault.OVERCURRENT: 0x03, Fault.UNDERVOLTAGE: 0x05, Fault.OVERHEATED: 0x09,

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 COLOURS = {"success": "green", "failure": "yellow", "error": "red"}
 REFRESH = 0.1
 LONGEST_TABLE = 24
+WIDEST_TABLE = 9
+"""Columns; wider tables are for --json and the report."""
 
 
 @contextmanager
@@ -55,7 +57,12 @@ def print_result(result: Mapping[str, Any]) -> None:
     """The result: lists of tables as tables, everything else in one line each."""
     console = Console()
     for key, value in result.items():
-        if isinstance(value, list) and value and all(isinstance(row, Mapping) for row in value):
+        if (
+            isinstance(value, list)
+            and value
+            and all(isinstance(row, Mapping) for row in value)
+            and len(value[0]) <= WIDEST_TABLE
+        ):
             console.print(_table(key, value))
     plain = Table.grid(padding=(0, 2))
     for key, value in result.items():
