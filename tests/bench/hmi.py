@@ -108,7 +108,7 @@ def task_of(places: list[str]) -> dict[str, Any]:
         {"name": n, "kind": "action", "label": "", "in_macro": "", "error": False, **at(i)}
         for i, n in enumerate(places)
     ]
-    steps = [
+    steps: list[dict[str, Any]] = [
         {"name": f"step_{i}", "label": "", "in_macro": "", "events": [], "when": "", "after": None, "error": False}
         | {"x": at(i)["x"] + 100, "y": at(i)["y"]}
         for i in range(len(places))

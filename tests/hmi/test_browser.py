@@ -617,3 +617,18 @@ async def test_fifty_updates_a_second_leave_no_gap(browser: Browser, page: Page,
     await expect(tab.locator("html")).to_have_attribute("data-sequence", last)
     assert await tab.evaluate("petrobot.link.gaps") == 0
     assert await tab.evaluate("petrobot.link.deltas") > 10
+
+
+async def test_the_stop_is_within_reach_of_every_dialog(browser: Browser, page: Page, stage: Stage) -> None:
+    """Whatever is asked, the emergency stop can be pressed, and Escape closes the question without an answer."""
+    tab = await designer(browser, page)
+    await tab.get_by_role("button", name="Keyboard").click()
+    dialog = tab.get_by_role("dialog", name="Keyboard")
+    await expect(dialog).to_be_visible()
+    await tab.get_by_role("button", name="Emergency stop").click()
+    await tab.keyboard.press("F9")
+    await expect(tab.get_by_text("Emergency stop given")).to_be_visible()
+    await dialog.get_by_role("button", name="Close").focus()
+    await tab.keyboard.press("Escape")
+    await expect(dialog).to_be_hidden()
+    assert [verb for _, verb, _ in stage.commands] == ["estop", "estop"]

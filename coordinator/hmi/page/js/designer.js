@@ -1,6 +1,7 @@
 // The designer: draw a task's net with mouse or keyboard, with every step undoable and faults shown where they are.
 
 import { Canvas, tool } from "./canvas.js";
+import { openDialog } from "./dialog.js";
 import { attribute, fill, h, s, text, words } from "./dom.js";
 import { askName, checkDocument, exportAs, importNet, listTasks, loadOffers, openTask, saveTask } from "./files.js";
 import { GRID } from "./geometry.js";
@@ -123,14 +124,12 @@ export class Designer {
     return new Promise((resolve) => {
       const end = (answer) => {
         dialog.close();
-        dialog.remove();
         resolve(answer);
       };
       const dialog = h("dialog", { "aria-label": question }, h("h2", {}, question), h("p", { class: "muted" }, "There are changes that are not saved."),
         h("div", { class: "buttons" }, h("button", { type: "button", class: "small", onclick: () => end(false) }, "Stay"), h("button", { type: "button", class: "command danger", onclick: () => end(true) }, "Leave")));
       dialog.addEventListener("cancel", () => end(false));
-      document.body.append(dialog);
-      dialog.showModal();
+      openDialog(dialog);
     });
   }
 
@@ -249,7 +248,7 @@ export class Designer {
     }
     for (const element of this.view.elements.values()) {
       const finding = worst.get(element.name);
-      this.view.mark(element.name, "fault", finding && finding.severity !== "info" ? (finding.severity === "error" ? "error" : "warning") : null, finding?.text ?? "");
+      this.view.mark(element.name, "fault", ["error", "warning"].includes(finding?.severity) ? finding.severity : null, finding?.text ?? "");
     }
     const errors = this.findings.filter((f) => f.severity === "error").length;
     const order = { error: 0, warning: 1 };

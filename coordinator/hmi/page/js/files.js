@@ -1,5 +1,6 @@
 // Task files on the server: open, save with revision, settle a conflict with both versions in view, import and export.
 
+import { openDialog } from "./dialog.js";
 import { fill, h } from "./dom.js";
 import { toast } from "./toast.js";
 
@@ -80,7 +81,6 @@ function settle(name, { yours, theirs }) {
   return new Promise((resolve) => {
     const done = (choice) => {
       dialog.close();
-      dialog.remove();
       resolve(choice);
     };
     const rows = differences(theirs.text, yours);
@@ -94,12 +94,8 @@ function settle(name, { yours, theirs }) {
         h("button", { type: "button", class: "small", onclick: () => done(null) }, "Go on editing"),
         h("button", { type: "button", class: "small", onclick: () => done("theirs") }, "Discard mine, load theirs"),
         h("button", { type: "button", class: "command danger", onclick: () => done("yours") }, "Replace theirs by mine")));
-    dialog.addEventListener("cancel", (event) => {
-      event.preventDefault();
-      done(null);
-    });
-    document.body.append(dialog);
-    dialog.showModal();
+    dialog.addEventListener("cancel", () => done(null));
+    openDialog(dialog);
   });
 }
 
@@ -172,7 +168,6 @@ export function askName(title, value) {
     const input = h("input", { value, "aria-label": "Name", pattern: "[A-Za-z0-9_][A-Za-z0-9_\\-]{0,63}", required: true });
     const end = (result) => {
       dialog.close();
-      dialog.remove();
       resolve(result);
     };
     const form = h("form", { method: "dialog", onsubmit: (e) => { e.preventDefault(); end(input.value.trim()); } },
@@ -180,8 +175,7 @@ export function askName(title, value) {
       h("div", { class: "buttons" }, h("button", { type: "button", class: "small", onclick: () => end(null) }, "Cancel"), h("button", { type: "submit", class: "command primary" }, "OK")));
     const dialog = fill(h("dialog", { "aria-label": title }), form);
     dialog.addEventListener("cancel", () => end(null));
-    document.body.append(dialog);
-    dialog.showModal();
+    openDialog(dialog);
     input.select();
   });
 }

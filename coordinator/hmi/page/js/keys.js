@@ -1,5 +1,6 @@
 // The designer by keyboard alone, and the list of its keys.
 
+import { openDialog } from "./dialog.js";
 import { h } from "./dom.js";
 
 const STEP = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
@@ -144,8 +145,7 @@ export class KeyHelp {
     const dialog = h("dialog", { class: "key-help", "aria-label": "Keyboard" }, h("h2", {}, "Keyboard"),
       h("dl", {}, LIST.map(([keys, what]) => h("div", {}, h("dt", {}, keys), h("dd", {}, what)))),
       h("div", { class: "buttons" }, h("button", { type: "button", class: "command primary", onclick: () => dialog.close() }, "Close")));
-    dialog.addEventListener("close", () => dialog.remove());
-    document.body.append(dialog);
-    dialog.showModal();
+    dialog.addEventListener("cancel", () => dialog.close());
+    openDialog(dialog);
   }
 }
