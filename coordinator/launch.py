@@ -167,7 +167,7 @@ def local_programs(directory: Directory, *, lockstep: bool = False, mock: Path |
     options = ["--services", str(directory.source), *(["--lockstep"] if lockstep else [])]
     scripted = ["--mock", str(mock)] if mock else []
     return [
-        Program(node.name, [sys.executable, "-m", "sim", *options])
+        Program(node.name, [sys.executable, "-m", "sim", *options], first=True)
         if node.sim
         else Program(node.name, [sys.executable, "-m", "services", node.name, *options, *scripted])
         for node in local

@@ -27,6 +27,8 @@ class Program:
 
     name: str
     command: Sequence[str]
+    first: bool = False
+    """Others need it: they are started when it is ready."""
 
 
 @dataclass
@@ -88,10 +90,12 @@ class Supervisor:
 
     async def start(self, timeout: float = 30.0) -> None:
         """Start all programs and wait until each is ready (unless told not to: lock-step nodes wait for the coordinator)."""
-        for child in self._children:
-            child.task = asyncio.create_task(self._keep(child), name=f"keep {child.program.name}")
-        for child in self._children if self._wait_ready else ():
-            await self._until_ready(child, timeout)
+        for first in (True, False):
+            group = [child for child in self._children if child.program.first is first]
+            for child in group:
+                child.task = asyncio.create_task(self._keep(child), name=f"keep {child.program.name}")
+            for child in group if self._wait_ready else ():
+                await self._until_ready(child, timeout)
 
     async def stop(self) -> None:
         """Ask all to end, and kill those that do not within 5 s."""

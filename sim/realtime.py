@@ -37,6 +37,10 @@ SLIP: Final = 0.1
 """s behind the clock from which on the world's time slips."""
 
 
+PRIORITY = 5
+"""Of the pacemaker's thread under SCHED_FIFO; below that of the drivers' processes."""
+
+
 class Pacemaker:
     """Moves a laboratory along with the clock and carries frames and images. `run` until `stop`, in a thread of its own."""
 
@@ -58,7 +62,9 @@ class Pacemaker:
         self._stopped.set()
 
     def run(self) -> None:
-        """Go on until stopped."""
+        """Go on until stopped. Ahead of other processes where that is permitted: drives and world do not wait for anybody."""
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
         self._begin = time.monotonic() - self._laboratory.now
         while not self._stopped.is_set():
             late = time.monotonic() - self._begin - self._laboratory.now - TICK

@@ -38,7 +38,7 @@ HEARTBEAT_MS: Final = 50
 """Period of everybody's heartbeat."""
 HEARTBEAT_PATIENCE_MS: Final = 200
 """Silence after which a node counts as lost (both ways)."""
-SILENT_CYCLES: Final = 5
+SILENT_CYCLES: Final = 10
 """Cycles without a drive's TPDO after which it counts as lost."""
 RETRY: Final = 1.0
 """Seconds before a failed configuration is tried again."""
