@@ -62,10 +62,36 @@ def test_sound_task_has_no_finding(task: Tasks) -> None:
             lambda t: t("x=1 w=1", {"t": {"in": "x", "event": "e"}, "u": {"in": "w", "event": "e"}}, "e*"),
         ),
         (
+            "unsettled-conflict",
+            E,
+            "transitions.t",
+            lambda t: t(
+                "x=1 w=1 y/1", {n: {"in": p, "out": "y", "event": "e"} for n, p in (("t", "x"), ("u", "w"))}, "e"
+            ),
+        ),
+        (
+            "unsettled-conflict",
+            E,
+            "transitions.t",
+            lambda t: t("x=1 w=1 y z", {"t": {"in": "x !z", "out": "y"}, "u": {"in": "w !y", "out": "z"}}),
+        ),
+        (
+            "unsettled-conflict",
+            E,
+            "transitions.t",
+            lambda t: t("a!2=2 x=1", {"t": {"in": "a:normal x"}, "u": {"in": "a:error x"}}),
+        ),
+        (
             "arrival-order",
             N,
             "transitions.t",
             lambda t: t("x=1", {"t": {"in": "x", "event": "e"}, "u": {"in": "x", "event": "f"}}, "e f*"),
+        ),
+        (
+            "unsettled-conflict",
+            E,
+            "transitions.t",
+            lambda t: t("x=1", {"t": {"in": "x", "event": "e"}, "u": {"in": "x", "event": "f"}}, "e+ f+"),
         ),
         (
             "arrival-order",
