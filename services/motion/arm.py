@@ -31,12 +31,10 @@ from services.motion.interception import STRATEGIES, Interceptor, Strategy
 from services.motion.kinematics import Puma, branch_of
 from services.motion.limits import Guard
 from services.motion.model import JOINTS, ArmModel, Cell, nominal_arm, nominal_cell, read_arm, read_cell
-from services.motion.trajectory import Trajectory, synchronised
+from services.motion.steering import Steering
 
 PERIOD: Final = 0.004
 """s, the servo's and the bus's cycle."""
-LOOK: Final = 3
-"""Cycles on a way round before the straight way is looked at again."""
 LEASE: Final = 0.5
 """s after which following ends in a hold if the action that asked for it has gone silent."""
 SPEED_SHARE: Final = 0.97
@@ -95,7 +93,6 @@ class Arm:
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         settings = Settings.parse(config)
         self._ports = ports
-        self._settings = settings
         self.model, cell = _numbers(settings, ports)
         self._puma = Puma.of(self.model)
         self._guard = Guard(self._puma, self.model, cell)
@@ -103,7 +100,8 @@ class Arm:
         self._interceptor = Interceptor(self._puma, cell, self._guard, home, branch_of(self._puma, np.asarray(home)))
         self._full_speed = (self.model.speed * (settings.speed * SPEED_SHARE)).tolist()
         self._full_acceleration = self.model.acceleration.tolist()
-        self._trajectory = Trajectory(home, PERIOD, self._full_speed, self._full_acceleration)
+        self._steering = Steering(self._guard, self._interceptor.retreat, home, PERIOD, self.model.acceleration)
+        self._trajectory = self._steering.trajectory
         self._master = DriveMaster(_drive_settings(self.model), PERIOD, enable=settings.enable)
         self._setpoint: Setpoint = ports.stream(settings.stream)
         self._bus = ports.can()
@@ -111,9 +109,6 @@ class Arm:
         self._ball = Barrier()
         self._mode = "off"
         self._reason = ""
-        self._refused = ""
-        self._share = 1.0
-        self._via: tuple[float, ...] | None = None
         self._paused = False
         self._leased_until = 0.0
         self._after_stop = ""
@@ -169,12 +164,12 @@ class Arm:
             "paused": self._paused,
             "q": tuple(self._measured),
             "qd": tuple(self._measured_speed),
-            "target": tuple(trajectory.target) if trajectory.target is not None else None,
+            "target": self._steering.goal,
             "commanded": tuple(trajectory.q),
             "in_place": self._in_place(),
             "still": self._standing(),
             "following_error": self._lag(),
-            "guard": self._refused,
+            "guard": self._steering.refused,
             "limited": master.limited,
             "faults": [(trouble.cause, trouble.joint, trouble.code, trouble.text) for trouble in master.troubles],
             "power": None if master.inputs is None else bool(master.inputs & POWER),
@@ -217,21 +212,16 @@ class Arm:
     def _move(self, now: float, body: Mapping[str, Any]) -> None:
         self._ready("move")
         target, share = self._pose(body.get("pose")), _share(body.get("speed", 1.0))
-        why = self._guard.violation(target)
-        if why:
-            raise ValueError(f"pose refused: {why}")
-        self._mode, self._reason, self._via, self._share = "move", "", None, share
-        self._steer(target)
-        self._trajectory.aim(target)
+        self._steering.move(target, share)
+        self._mode, self._reason = "move", ""
 
     def _follow(self, now: float, body: Mapping[str, Any]) -> None:
         self._ready("follow")
         strategy = _strategy(body, self._follower.strategy)
         if self._mode != "follow":
-            self._trajectory.limit(self._speeds(), self._full_acceleration)
+            self._steering.rest()
             self._follower.begin(self._setpoint.count)
             self._ball.arm()
-            self._via = None
         self._follower.strategy = strategy
         self._leased_until = now + LEASE
         self._mode, self._reason = "follow", self._reason if self._mode == "follow" else ""
@@ -259,18 +249,10 @@ class Arm:
         return [float(angle) for angle in pose]
 
     # The cycle.
-    def _speeds(self, share: float = 1.0) -> list[float]:
+    def _speeds(self) -> list[float]:
         """Joint speeds to command: the settings' or the drives' own, whichever is less (rad/s)."""
         drives = [SPEED_SHARE * speed or math.inf for speed in self._master.speeds]
-        return [share * min(mine, theirs) for mine, theirs in zip(self._full_speed, drives, strict=True)]
-
-    def _change_speeds(self) -> None:
-        """The drives go faster or slower than they did: at once while following, else no faster than they can."""
-        self._drive_speeds = self._master.speeds
-        speeds = self._speeds()
-        if self._mode == "move":
-            speeds = [min(pair) for pair in zip(speeds, self._trajectory.speed, strict=True)]
-        self._trajectory.limit(speeds, self._trajectory.acceleration)
+        return [min(mine, theirs) for mine, theirs in zip(self._full_speed, drives, strict=True)]
 
     def _measure(self) -> None:
         before, self._measured = self._measured, self._master.positions
@@ -287,7 +269,8 @@ class Arm:
         enabled = self._master.enabled
         if self._mode == "off":
             if enabled:
-                self._trajectory.reset(self._measured)
+                self._steering.reset(self._measured)
+                self._steering.limit(self._speeds())
                 self._commanded.clear()
                 self._mode, self._reason = "hold", "enabled"
             return
@@ -295,7 +278,8 @@ class Arm:
             self._off("fault" if self._master.troubles else "disabled")
             return
         if self._master.speeds != self._drive_speeds:
-            self._change_speeds()
+            self._drive_speeds = self._master.speeds
+            self._steering.limit(self._speeds())
         moves = not (self._trajectory.still and self._standing())
         if moves and not self._master.limited and self._lag() > LOST:
             self._master.give_up(f"the joints are more than {LOST} rad off the commanded path")
@@ -307,57 +291,10 @@ class Arm:
             self._after_stop, self._master.wanted = "", False
 
     def _advance(self) -> None:
-        trajectory = self._trajectory
-        self._commanded.append(trajectory.q)
-        if self._paused:
-            trajectory.accept(*trajectory.braking())
-        elif trajectory.target is None or trajectory.arrived(0.0):
-            trajectory.accept(*trajectory.proposed())
-        else:
-            self._go_on()
-            if self._mode == "follow":
-                self._follower.executed(self._ports.now)
-
-    def _go_on(self) -> None:
-        """One cycle towards the target, by way of another pose where the straight way is not clear."""
-        trajectory, target = self._trajectory, self._trajectory.target
-        assert target is not None
-        if self._via is not None and self._cycles % LOOK == 0:
-            rest = trajectory.resting(trajectory.q, trajectory.qd)
-            if self._guard.path_clear(rest, target):
-                self._go_by(None, target)
-            elif trajectory.still:
-                self._go_by(self._way_round(target), target)
-        trajectory.aim(target if self._via is None else self._via)
-        refused = self._guard.advance(trajectory)
-        trajectory.aim(target)
-        if refused and self._via is None:
-            self._go_by(self._way_round(target), target)
-        self._refused = refused
-
-    def _go_by(self, via: tuple[float, ...] | None, target: Sequence[float]) -> None:
-        """Go by way of a pose, or straight: synchronised, so that the way is straight, but in haste while following."""
-        self._via = via
-        if via is None and self._mode == "follow":
-            self._trajectory.limit(self._speeds(), self._full_acceleration)
-        else:
-            self._steer(target if via is None else via)
-
-    def _steer(self, goal: Sequence[float]) -> None:
-        """Limits under which all joints come to a pose together; from motion only nearly so."""
-        trajectory = self._trajectory
-        error = np.subtract(goal, trajectory.resting(trajectory.q, trajectory.qd))
-        share = self._share if self._mode == "move" else 1.0
-        speed, acceleration = synchronised(error, np.array(self._speeds(share)), self.model.acceleration * share)
-        trajectory.limit(speed.tolist(), acceleration.tolist())
-
-    def _way_round(self, target: Sequence[float]) -> tuple[float, ...]:
-        """Where to go first when the straight way is not clear: to before the target, back from the table, or home."""
-        rest = self._trajectory.resting(self._trajectory.q, self._trajectory.qd)
-        for via in (self._interceptor.retreat(target), self._interceptor.retreat(rest)):
-            if via is not None and self._guard.path_clear(rest, via):
-                return via
-        return self.model.poses["home"]
+        self._commanded.append(self._trajectory.q)
+        self._steering.cycle(self._paused)
+        if self._mode == "follow" and self._steering.goal is not None and not self._paused:
+            self._follower.executed(self._ports.now)
 
     def _follow_on(self, now: float) -> None:
         """Aim at the newest prediction, or hold where it is stale or the action silent."""
@@ -368,28 +305,26 @@ class Arm:
         if not follower.take(self._setpoint, now):
             if follower.fresh(now):
                 return
-            trajectory.aim(None)
+            self._steering.rest()
             follower.drop()
             self._reason = "no_setpoint"
             return
-        plan = follower.plan_with(self._interceptor, trajectory, now)
+        plan = follower.plan_with(self._interceptor, trajectory, self._speeds(), self._full_acceleration, now)
         self._reason = "" if plan is not None else "unreachable"
         if plan is None:
-            return
-        rest = trajectory.resting(trajectory.q, trajectory.qd)
-        trajectory.aim(plan.q)
-        self._go_by(None if self._guard.path_clear(rest, plan.q) else self._way_round(plan.q), plan.q)
+            self._steering.rest()
+        else:
+            self._steering.chase(plan.q)
 
     def _rest(self, reason: str) -> None:
         """Come to rest and stay there."""
         if self._mode == "off":
             return
-        self._trajectory.limit(self._speeds(), self._full_acceleration)
-        self._trajectory.aim(None)
+        self._steering.rest()
         self._mode, self._reason, self._after_stop = "hold", reason, ""
 
     def _off(self, reason: str) -> None:
-        self._trajectory.reset(self._measured)
+        self._steering.reset(self._measured)
         self._mode, self._reason, self._after_stop = "off", reason, ""
 
     def _lag(self) -> float:
@@ -403,13 +338,8 @@ class Arm:
         if self._mode == "follow":
             plan = self._follower.plan
             return plan is not None and self._off_by(plan.q) < NEAR_PLACE
-        target = self._trajectory.target
-        return (
-            self._mode == "move"
-            and target is not None
-            and self._trajectory.arrived()
-            and self._off_by(target) < IN_PLACE
-        )
+        goal = self._steering.goal
+        return self._mode == "move" and goal is not None and self._steering.arrived and self._off_by(goal) < IN_PLACE
 
     def _off_by(self, q: Sequence[float]) -> float:
         return max(abs(a - b) for a, b in zip(q, self._measured, strict=True))

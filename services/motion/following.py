@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, Final
 
 from services.device import Setpoint
@@ -70,7 +71,14 @@ class Follower:
         """The last set point has become stale: its values count as new if they come again."""
         self._values = None
 
-    def plan_with(self, interceptor: Interceptor, trajectory: Trajectory, now: float) -> Plan | None:
+    def plan_with(
+        self,
+        interceptor: Interceptor,
+        trajectory: Trajectory,
+        speed: Sequence[float],
+        acceleration: Sequence[float],
+        now: float,
+    ) -> Plan | None:
         """Plan for the prediction just taken; None if it cannot be reached (the plan of before is forgotten)."""
         assert self._prediction is not None
         if self.plan is not None and self.plan.arrival - (now - self._made) < FROZEN:
@@ -80,8 +88,8 @@ class Follower:
             self._prediction,
             trajectory.q,
             trajectory.qd,
-            trajectory.speed,
-            trajectory.acceleration,
+            speed,
+            acceleration,
             self.plan,
         )
         self._made = now

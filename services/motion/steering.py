@@ -1,0 +1,123 @@
+"""Steering: from a goal to commanded positions, within limits, past the guard, and round what stands in the way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import numpy as np
+
+from services.motion.limits import Guard
+from services.motion.model import Vector
+from services.motion.trajectory import Trajectory, synchronised
+
+LOOK: Final = 3
+"""Cycles on a way round before the straight way is looked at again."""
+
+Retreat = Callable[[Sequence[float]], tuple[float, ...] | None]
+"""Gives the pose that holds the cup as a joint pose does, but further from the table; None if there is none that is clear."""
+
+
+class Steering:
+    """Moves a trajectory to goals. `move` goes straight in joint space, all joints arriving together; `chase` goes as fast as
+    each joint can. Both go by way of another pose where the straight way is not clear. Angles in rad, speeds in rad/s.
+    """
+
+    def __init__(
+        self, guard: Guard, retreat: Retreat, home: Sequence[float], period: float, acceleration: Vector
+    ) -> None:
+        self._guard = guard
+        self._retreat = retreat
+        self._home = tuple(home)
+        self._acceleration = acceleration
+        self._speed = np.ones_like(acceleration)
+        self.trajectory = Trajectory(home, period, self._speed.tolist(), acceleration.tolist())
+        self.goal: tuple[float, ...] | None = None
+        self.refused = ""
+        """What the last step was refused for; empty if it was not."""
+        self._via: tuple[float, ...] | None = None
+        self._together = False
+        self._share = 1.0
+        self._cycles = 0
+
+    def limit(self, speed: Sequence[float]) -> None:
+        """Greatest joint speeds from now on."""
+        self._speed = np.array(speed)
+        self._choose_limits()
+
+    def move(self, goal: Sequence[float], share: float = 1.0) -> None:
+        """Go to a joint pose at a share of the greatest speeds. Raises ValueError if the pose is not clear."""
+        why = self._guard.violation(goal)
+        if why:
+            raise ValueError(f"pose refused: {why}")
+        self._share, self._together, self._via, self.goal = share, True, None, tuple(goal)
+        self._choose_limits()
+
+    def chase(self, goal: Sequence[float]) -> None:
+        """Go to a joint pose in haste; may be called in any cycle with another one."""
+        self._share, self._together, self.goal = 1.0, False, tuple(goal)
+        self._go_by(None if self._guard.path_clear(self._rest(), goal) else self._way_round(goal))
+
+    def rest(self) -> None:
+        """Brake at the limits and stay there."""
+        self.goal, self._via = None, None
+
+    def reset(self, q: Sequence[float]) -> None:
+        """Stand still here: the drives were off, or are."""
+        self.rest()
+        self.trajectory.reset(q)
+
+    def cycle(self, braking: bool = False) -> None:
+        """The next commanded position; with `braking` on the way to a standstill, the goal kept."""
+        self._cycles += 1
+        trajectory = self.trajectory
+        if braking or self.goal is None:
+            trajectory.accept(*trajectory.braking())
+            return
+        if self._via is not None and self._cycles % LOOK == 0:
+            if self._guard.path_clear(self._rest(), self.goal):
+                self._go_by(None)
+            elif trajectory.still:
+                self._go_by(self._way_round(self.goal))
+        trajectory.aim(self.goal if self._via is None else self._via)
+        if self._via is None and trajectory.arrived(0.0):
+            return
+        self.refused = self._guard.advance(trajectory)
+        if self.refused and self._via is None:
+            self._go_by(self._way_round(self.goal))
+
+    @property
+    def arrived(self) -> bool:
+        """Whether the commanded motion rests on its goal."""
+        trajectory = self.trajectory
+        return (
+            self.goal is not None
+            and trajectory.still
+            and tuple(trajectory.target or ()) == self.goal
+            and trajectory.arrived()
+        )
+
+    def _rest(self) -> list[float]:
+        return self.trajectory.resting(self.trajectory.q, self.trajectory.qd)
+
+    def _go_by(self, via: tuple[float, ...] | None) -> None:
+        self._via = via
+        self._choose_limits()
+
+    def _choose_limits(self) -> None:
+        """On a move or a way round all joints come to its end together, so that the way is straight; from motion nearly so."""
+        speed, acceleration = self._speed * self._share, self._acceleration * self._share
+        end = self._via or self.goal
+        if end is not None and (self._together or self._via is not None):
+            speed, acceleration = synchronised(np.subtract(end, self._rest()), speed, acceleration)
+        elif not self._together:
+            acceleration = self._acceleration
+        self.trajectory.limit(speed.tolist(), acceleration.tolist())
+
+    def _way_round(self, goal: Sequence[float]) -> tuple[float, ...]:
+        """Where to go first when the straight way is not clear: to before the goal, back from the table, or home."""
+        rest = self._rest()
+        for via in (self._retreat(goal), self._retreat(rest)):
+            if via is not None and self._guard.path_clear(rest, via):
+                return via
+        return self._home
