@@ -63,6 +63,7 @@ class Part:
     cause: str = ""
     text: str = ""
     executed: Executed = Executed.YES
+    values: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass
@@ -347,7 +348,7 @@ class Stage:
                 continue
             del self._playing[run]
             part = playing.part
-            self._stimulate(RunEnded(run, part.status, part.cause, part.text, part.executed, {}, part.seconds))
+            self._stimulate(RunEnded(run, part.status, part.cause, part.text, part.executed, part.values, part.seconds))
         for key in [k for k, due in self._timers.items() if due <= self.clock]:
             del self._timers[key]
             self._stimulate(TimerFired(key))

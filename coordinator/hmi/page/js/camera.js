@@ -30,7 +30,10 @@ class Frame {
     const mime = /^image\/(jpeg|png|webp)$/.test(image.mime) ? image.mime : "image/jpeg";
     attribute(this.image, "href", `data:${mime};base64,${image.data}`);
     const seen = image.detections ?? [];
-    const label = (d) => s("text", { class: "detection-label", "font-size": Math.max(10, height / 20), x: (d.x ?? 0) + (d.r ?? 0) + 6, y: (d.y ?? 0) - 6 }, d.label);
+    const label = (d) => {
+      const far = (d.x ?? 0) > 0.75 * width; // near the right edge the label stands to the left
+      return s("text", { class: "detection-label", "font-size": Math.max(10, height / 18), "text-anchor": far ? "end" : "start", x: (d.x ?? 0) + (far ? -1 : 1) * ((d.r ?? 0) + 8), y: (d.y ?? 0) - 8 }, d.label);
+    };
     fill(this.over, seen.map(shape), seen.filter((d) => d.label).map(label));
     text(this.note, [image.age !== undefined ? `${Math.round(image.age * 1000)} ms old` : "", image.note].filter(Boolean).join(" · "));
   }

@@ -225,7 +225,7 @@ export class History {
     if (!this.other) return fill(this.about, run.fault ? h("span", {}, icon("warning"), ` ${run.fault}. `) : null, facts);
     const first = this.firstDifference();
     if (!first) return fill(this.about, "Both runs fired the same transitions in the same order.");
-    const name = (reel) => words(reel.firings[first - 1]?.transition ?? "nothing more");
+    const name = (reel) => (reel.firings[first - 1] ? this.labelOf(reel.firings[first - 1].transition) : "nothing more");
     return fill(this.about, `The runs differ from firing ${first}: ${name(this.reel)} here, ${name(this.other)} there. `, h("button", { type: "button", class: "small", onclick: () => this.go(this.reel.atFirings(first)) }, "Go there"));
   }
 
@@ -258,6 +258,11 @@ export class History {
     return this.every.checked || record.firings.length > 0 || Object.keys(record.marking).length > 0 || record.notes?.length > 0;
   }
 
+  /** How a transition is called on the drawing. */
+  labelOf(name) {
+    return words(this.reel.run.task?.transitions.find((t) => t.name === name)?.label || name);
+  }
+
   toError(step) {
     for (let i = this.index + step; i >= 1 && i <= this.reel.records.length; i += step) if (this.reel.records[i - 1].error) return this.go(i, false);
     return null;
@@ -271,7 +276,7 @@ export class History {
     let current = null;
     fill(this.rowsBox, listed.slice(from, from + 2 * ROWS_AROUND).map(([record, at]) => {
       const row = h("li", {}, h("button", { type: "button", class: `record${record.error ? " error" : ""}${at > this.index ? " future" : ""}`, "aria-current": at === this.index ? "true" : null, onclick: () => this.go(at, false) },
-        h("span", { class: "line" }, h("strong", {}, record.firings.length ? record.firings.map((f) => words(f.transition)).join(", ") : words(record.text)), h("span", { class: "number muted" }, seconds(record.t))),
+        h("span", { class: "line" }, h("strong", {}, record.firings.length ? record.firings.map((f) => this.labelOf(f.transition)).join(", ") : words(record.text)), h("span", { class: "number muted" }, seconds(record.t))),
         record.firings.length ? h("span", { class: "detail" }, words(record.text)) : null,
         record.firings.map(reasonText).filter(Boolean).map((r) => h("span", { class: "detail reason" }, r)),
         (record.notes ?? []).map((note) => h("span", { class: "detail" }, words(note)))));

@@ -470,7 +470,7 @@ export class NetView {
 }
 
 const MARK_AT = {
-  place: { fold: [18, 18], fault: [18, -18], breakpoint: [-19, -19], reason: [18, -18] },
+  place: { fold: [26, 21], fault: [25, -21], breakpoint: [-25, -21], reason: [25, -21] },
   transition: { fold: [14, 20], fault: [14, -24], breakpoint: [-14, -24], reason: [14, -24] },
 };
 const MARK_GLYPH = { fold: "M12 4.5v9M12 17.5v.6", breakpoint: "", failed: "M12 4.5v9M12 17.5v.6" };
