@@ -13,13 +13,21 @@ NAME = "coordinator"
 
 
 class CoordinatorParty:
-    """Implements `services.comm.party.Party`. `watch(now)` is called once a tick, for progress shown to people."""
+    """Implements `services.comm.party.Party`. `watch(now)` is called once a tick, for progress shown to people; `begin(now)`
+    once every node is there (the mission's start, unless a recorded run is to go on)."""
 
-    def __init__(self, directory: Directory, mission: Mission, watch: Callable[[float], None] | None = None) -> None:
+    def __init__(
+        self,
+        directory: Directory,
+        mission: Mission,
+        watch: Callable[[float], None] | None = None,
+        begin: Callable[[float], None] | None = None,
+    ) -> None:
         self.name = NAME
         self.mission = mission
         self._directory = directory
         self._watch = watch
+        self._begin = begin or mission.start
         self._now = 0.0
         for caller in mission.callers.values():
             caller.open(0.0)
@@ -43,7 +51,7 @@ class CoordinatorParty:
                 mission.take(now, node, notices)
         mission.advance(now)
         if mission.stage is Stage.CONNECTING and all(caller.up for caller in mission.callers.values()):
-            mission.start(now)
+            self._begin(now)
         if self._watch is not None:
             self._watch(now)
 

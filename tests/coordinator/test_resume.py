@@ -96,13 +96,12 @@ class Laboratory:
         assert self.cell is not None
         journal = read_journal(self.folder / "run.journal")
         mission, go_on = resumed_mission(self.directory, task, Engine(task), journal, [], self.cell.now)
-        mission.start = go_on  # type: ignore[method-assign]
-        self.go(mission)
+        self.go(mission, go_on)
         return mission
 
-    def go(self, mission: Mission) -> None:
+    def go(self, mission: Mission, begin: Callable[[float], None] | None = None) -> None:
         """Run the cell with this coordinator until it is over; raises CrashError when it dies."""
-        party = CoordinatorParty(self.directory, mission)
+        party = CoordinatorParty(self.directory, mission, begin=begin)
         if self.cell is None:
             self.cell = Cell([party, self.node])
         else:
