@@ -143,14 +143,15 @@ class Caller:
         seed: int = 0,
         epoch: int = 0,
         boot: str = "",
+        auto_ack: bool = False,
     ) -> None:
-        """`call` by the fields of a Call."""
+        """`call` by the fields of a Call; with `auto_ack` its result is acknowledged as soon as it comes."""
         if id in self._pending:
             raise ValueError(f"call {id}: this id is under way already")
         if arguments:
             arguments = plain(arguments, "arguments")
         call = Call(id, service, arguments, deadline, epoch or self.hello.epoch, boot or self.boot, parent, seed)
-        pending = self._pending[id] = Pending(call, not boot, now)
+        pending = self._pending[id] = Pending(call, not boot, now, auto_ack or self._auto_ack)
         if self.up:
             self._send(now, pending)
         elif self._refusal:
@@ -278,11 +279,13 @@ class Caller:
 
     def _take_outcome(self, now: float, outcome: Outcome) -> None:
         id_ = outcome.id
-        if self._pending.pop(id_, None) is not None:
-            self._settled.end(id_, False)
-            self._notices.append(Ended(outcome))
-            if self._auto_ack:
+        pending = self._pending.pop(id_, None)
+        if pending is not None:
+            if pending.auto_ack:
                 self._ack(now, id_)
+            else:
+                self._settled.end(id_, False)
+            self._notices.append(Ended(outcome))
             return
         safe = self._settled.is_safe(id_)
         if safe is None:
@@ -343,11 +346,17 @@ class Caller:
         self.soonest = soonest
         return soonest if soonest < NEVER else None
 
+    @property
+    def has_news(self) -> bool:
+        """Whether there are notices to take out."""
+        return bool(self._notices)
+
     def messages(self, now: float | None = None) -> list[Message]:
         """What to send, in order; each message is given once. Acknowledgements wait for others until `now` reaches theirs."""
-        ack = self._settled.take_acks(now)
-        if ack is not None:
-            self._messages.append(ack)
+        if now is None or now >= self._settled.due:
+            ack = self._settled.take_acks()
+            if ack is not None:
+                self._messages.append(ack)
         if not self._messages:
             return []
         messages, self._messages = self._messages, []

@@ -15,8 +15,9 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from services.comm.caller import Caller, Ended, Notice
-from services.comm.link import Limits, Link, Timing
+from services.comm.link import READ_BUFFER, Limits, Link, Timing, clock_of
 from services.comm.messages import Bye, Call, Executed, Message, Outcome, Refuse, Welcome
+from services.comm.under_way import NEVER
 from services.comm.wire import ProtocolError, Side, State
 
 OnNotices = Callable[[float, list[Notice]], None]
@@ -27,7 +28,7 @@ class _ClientLink(Link):
     """One connection to the peer."""
 
     def __init__(self, client: Client) -> None:
-        super().__init__(Side.CLIENT, client.key, client.timing, client.limits)
+        super().__init__(Side.CLIENT, client.key, client.timing, client.limits, client.buffer)
         self._client = client
         self.finished = asyncio.Event()
         self.refusal: Refuse | None = None
@@ -67,15 +68,13 @@ class _ClientLink(Link):
 class _Asked(asyncio.Future[Outcome]):
     """Outcome of a call made by `Client.call`."""
 
-    def __init__(self, client: Client, id_: str) -> None:
-        super().__init__(loop=client.loop)
-        self._client = client
-        self._id = id_
+    asked: tuple[Client, str]
 
     def cancel(self, msg: Any = None) -> bool:
         cancelled = super().cancel(msg)
         if cancelled:
-            self._client.give_up(self._id)
+            client, id_ = self.asked
+            client.give_up(id_)
         return cancelled
 
 
@@ -99,22 +98,22 @@ class Client:
         self.port = port
         self.caller = caller
         self.loop = self._loop = asyncio.get_running_loop()
+        self.now = clock_of(self.loop)
+        """The clock that the caller lives by: monotonic, of the loop (s)."""
         self.key = key
         self.timing = timing or Timing()
         self.limits = limits or Limits()
+        self.buffer = bytearray(READ_BUFFER)
         self._on_notices = on_notices
         self._link: _ClientLink | None = None
         self._task: asyncio.Task[None] | None = None
         self._timer: asyncio.TimerHandle | None = None
+        self._armed = NEVER
         self._flushing = False
         self._futures: dict[str, asyncio.Future[Outcome]] = {}
         self._numbers = 0
         self._up = asyncio.Event()
         self._prefix = f"{caller.hello.name}/{caller.hello.boot}/"
-
-    def now(self) -> float:
-        """The clock that the caller lives by: monotonic, of the loop (s)."""
-        return self._loop.time()
 
     def start(self) -> None:
         """Begin to connect."""
@@ -139,7 +138,7 @@ class Client:
             await link.finished.wait()
         if self._timer is not None:
             self._timer.cancel()
-            self._timer = None
+            self._timer, self._armed = None, NEVER
         self.caller.link_down(self.now(), text, final=True)
         self._tell(self.now())
 
@@ -157,9 +156,10 @@ class Client:
         """Call a service: a future of its outcome, which is acknowledged when it comes. Cancelling it cancels the call."""
         self._numbers += 1
         id_ = f"{self._prefix}{self._numbers}"
-        now = self._loop.time()
-        self.caller.begin(now, id_, service, arguments, deadline, parent, seed)
-        future = self._futures[id_] = _Asked(self, id_)
+        now = self.now()
+        self.caller.begin(now, id_, service, arguments, deadline, parent, seed, auto_ack=True)
+        future = self._futures[id_] = _Asked(loop=self.loop)
+        future.asked = self, id_
         if len(self._futures) == 1:
             self.flush(now)
         elif not self._flushing:
@@ -179,15 +179,17 @@ class Client:
 
     def flush(self, now: float | None = None) -> None:
         """Send the caller's messages and tell its notices; call it after each use of the caller."""
-        now = self._loop.time() if now is None else now
-        messages = self.caller.messages(now)
+        now = self.now() if now is None else now
+        caller = self.caller
+        messages = caller.messages(now)
         if messages and self._link is not None:
             if len(messages) == 1:
                 self._link.send_one(messages[0])
             else:
                 self._link.send(messages)
-        self._tell(now)
-        if self._timer is None or self._timer.when() > self.caller.soonest:
+        if caller.has_news:
+            self._tell(now)
+        if caller.soonest < self._armed:
             self._arm()
 
     def _tell(self, now: float) -> None:
@@ -202,7 +204,6 @@ class Client:
                 future = futures.pop(outcome.id)
                 if not future.done():
                     future.set_result(outcome)
-                self.caller.acknowledge(now, outcome.id)
             else:
                 rest.append(notice)
         if rest and self._on_notices is not None:
@@ -210,14 +211,15 @@ class Client:
 
     def _arm(self) -> None:
         due = self.caller.due()
-        if due is None or (self._timer is not None and self._timer.when() <= due):
+        if due is None or due >= self._armed:
             return
         if self._timer is not None:
             self._timer.cancel()
+        self._armed = due
         self._timer = self._loop.call_at(due, self._advance)
 
     def _advance(self) -> None:
-        self._timer = None
+        self._timer, self._armed = None, NEVER
         now = self.now()
         self.caller.advance(now)
         self.flush(now)

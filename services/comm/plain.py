@@ -43,19 +43,28 @@ def plain(value: Any, where: str = "value") -> Any:
 
 def _plain(value: Any, where: str, depth: int) -> Any:
     kind = type(value)
-    if kind in SCALARS:
-        if kind is int and not _INT_MIN <= value <= _INT_MAX:
+    if kind in _SIMPLE:
+        return value
+    if kind is int:
+        if not _INT_MIN <= value <= _INT_MAX:
             raise NotPlainError(f"{where}: the integer {value} does not fit in 64 bits")
         return value
     if depth == 0:
         raise NotPlainError(f"{where}: nested deeper than {DEPTH} levels")
-    if kind is dict and _KEYS.issuperset(map(type, value)) and _SIMPLE.issuperset(map(type, value.values())):
-        return value.copy()
-    if kind is dict or isinstance(value, Mapping):
-        return {_key(key, where): _plain(item, f"{where}.{key}", depth - 1) for key, item in value.items()}
     if kind is list or kind is tuple:
         return _plain_list(value, where, depth)
+    if kind is dict or isinstance(value, Mapping):
+        return _plain_dict(value, where, depth)
     return _plain_other(value, where, depth)
+
+
+def _plain_dict(value: Mapping[Any, Any], where: str, depth: int) -> dict[str, Any]:
+    copy = {}
+    for key, item in value.items():
+        if type(key) is not str:
+            raise NotPlainError(f"{where}: the key {key!r} is not a str")
+        copy[key] = item if type(item) in _SIMPLE else _plain(item, f"{where}.{key}", depth - 1)
+    return copy
 
 
 def _plain_list(value: Sequence[Any], where: str, depth: int) -> list[Any]:
@@ -74,12 +83,6 @@ def _plain_other(value: Any, where: str, depth: int) -> Any:
         return _plain_list(value, where, depth)
     remedy = "; use .tolist()" if isinstance(value, np.ndarray) else ""
     raise NotPlainError(f"{where}: a {type(value).__name__} is not plain data{remedy}")
-
-
-def _key(key: Any, where: str) -> str:
-    if type(key) is not str:
-        raise NotPlainError(f"{where}: the key {key!r} is not a str")
-    return key
 
 
 def inspect(value: Any, extra: frozenset[type] = frozenset(), depth: int = DEPTH) -> None:

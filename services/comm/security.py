@@ -28,7 +28,7 @@ _BLOCK = 64
 class _Hash(Protocol):
     def copy(self) -> _Hash: ...
 
-    def update(self, data: bytes, /) -> None: ...
+    def update(self, data: bytes | memoryview, /) -> None: ...
 
     def digest(self) -> bytes: ...
 
@@ -85,7 +85,7 @@ class Seal:
         self._outer: _Hash = hashlib.sha256(bytes(byte ^ 0x5C for byte in own))
         self._number = 0
 
-    def next(self, body: bytes) -> bytes:
+    def next(self, body: bytes | memoryview) -> bytes:
         """Seal of the next frame (16 bytes)."""
         inner = self._inner.copy()
         inner.update(self._number.to_bytes(8, "big"))

@@ -15,7 +15,7 @@ import asyncio
 from collections.abc import Callable
 
 from services.comm.callee import Callee, Order
-from services.comm.link import Limits, Link, Timing
+from services.comm.link import READ_BUFFER, Limits, Link, Timing
 from services.comm.messages import Answer, Bye, Call, Hello, Message, Outcome, Refuse
 from services.comm.security import is_loopback, require_key
 from services.comm.wire import ProtocolError, Side, State
@@ -27,7 +27,7 @@ class _ServerLink(Link):
     """A caller's connection."""
 
     def __init__(self, server: Server) -> None:
-        super().__init__(Side.SERVER, server.key, server.timing, server.limits)
+        super().__init__(Side.SERVER, server.key, server.timing, server.limits, server.buffer)
         self._server = server
         self.peer = ""
         """The caller's name, once it is welcome."""
@@ -100,6 +100,7 @@ class Server:
         self.limits = limits or Limits()
         self.faults: dict[str, int] = {}
         """How often callers broke the protocol, by code."""
+        self.buffer = bytearray(READ_BUFFER)
         self._on_orders = on_orders
         self._links: dict[str, _ServerLink] = {}
         self._opening: dict[_ServerLink, None] = {}

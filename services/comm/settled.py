@@ -28,12 +28,12 @@ class Settled:
     def end(self, id_: str, safe: bool) -> None:
         """The peer's result of this call has come, and is safe already or not yet."""
         self._safe[id_] = safe
-        if len(self._safe) > 2 * REMEMBERED:
-            # In bulk, so that a single call pays nothing for it; what is not safe yet stays.
-            oldest = list(self._safe)[:REMEMBERED]
-            for old in oldest:
-                if self._safe[old]:
-                    del self._safe[old]
+
+    def _prune(self) -> None:
+        """Forget the oldest in bulk, so that a single call pays nothing for it; what is not safe yet stays."""
+        for old in list(self._safe)[:REMEMBERED]:
+            if self._safe[old]:
+                del self._safe[old]
 
     def is_safe(self, id_: str) -> bool | None:
         """Whether the peer's result of this call is safe; None if none has come."""
@@ -56,18 +56,21 @@ class Settled:
 
     def acknowledge(self, now: float, id_: str) -> None:
         """Tell the peer soon that this result is safe."""
-        self._safe[id_] = True
+        safe = self._safe
+        safe[id_] = True
+        if len(safe) > 2 * REMEMBERED:
+            self._prune()
         if not self._acks:
             self.due = now + self._delay
         self._acks.append(id_)
+        if len(self._acks) >= ACKS_AT_ONCE:
+            self.due = now
 
-    def take_acks(self, now: float | None) -> ResultAck | None:
-        """The acknowledgement that is due: of all that wait, once they are many or the first has waited (or without `now`)."""
+    def take_acks(self) -> ResultAck | None:
+        """The acknowledgement of all that wait. To be asked for once it is `due`."""
         acks = self._acks
-        if not acks or (now is not None and now < self.due and len(acks) < ACKS_AT_ONCE):
-            return None
         self._acks, self.due = [], _NEVER
-        return ResultAck(acks[0], tuple(acks[1:]))
+        return ResultAck(acks[0], tuple(acks[1:])) if acks else None
 
     def link_lost(self) -> None:
         """What waits is not told any more: the peer lists what it keeps when it is back."""

@@ -37,6 +37,8 @@ class Pending:
     any_boot: bool
     """Until it is sent, it may go to whatever boot the peer is; False when its owner names one."""
     made: float
+    auto_ack: bool = False
+    """Its result is acknowledged as soon as it comes."""
     sent: bool = False
     accepted: bool = False
     cancel: str | None = None

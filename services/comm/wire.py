@@ -18,7 +18,7 @@ from dataclasses import replace
 from enum import Enum
 from typing import Final
 
-from services.comm.codec import LIMITS, ProtocolError, decode, encode, kind_of
+from services.comm.codec import LIMITS, ProtocolError, decode, decode_kind, encode, kind_of
 from services.comm.messages import (
     Accept,
     Answer,
@@ -54,6 +54,7 @@ NEWEST_VERSION: Final = 1
 """Versions of the protocol that this code speaks."""
 
 _HEADER: Final = 4
+_LARGE: Final = 4096
 
 
 class Side(Enum):
@@ -177,10 +178,12 @@ class Connection:
             raise ProtocolError("out_of_turn", f"{type(message).__name__} cannot be sent while {self._phase.value}")
         if self._phase is not _Phase.OPEN:
             return self._send_opening(message)
-        data = self._frame(encode(message))
+        body = encode(message)
         if kind in _LAST:
             self._enter(_Phase.CLOSING)
-        return data
+        if self._seal_out is not None:
+            return self._frame(body)
+        return len(body).to_bytes(_HEADER, "big") + body
 
     def refusal(self, refuse: Refuse) -> bytes:
         """Bytes of the last word to a side that has broken the protocol, sealed if the connection was open."""
@@ -233,13 +236,18 @@ class Connection:
         if self._phase in (_Phase.CLOSING, _Phase.CLOSED):
             return messages
         buffer = self._buffer
-        if not buffer and self._phase is _Phase.OPEN and self._is_one_frame(data):
-            return [self._only(data)]
+        if not buffer and self._phase is _Phase.OPEN and len(data) > _HEADER + SEAL_BYTES + 2:
+            # The usual case: these bytes are one whole frame of a kind that may come.
+            kind, length = data[_HEADER + 1], len(data) - _HEADER
+            if kind in self._may_come and int.from_bytes(data[:_HEADER], "big") == length <= LIMITS[kind]:
+                return [self._only(data, kind)]
         buffer += data
         start = 0
         try:
             while self.state is not State.CLOSED and (end := self._frame_end(start)):
-                message = self._take(bytes(buffer[start + _HEADER : end]))
+                with memoryview(buffer) as view:
+                    body = bytes(view[start + _HEADER : end])
+                message = self._take(body)
                 start = end
                 if message is not None:
                     messages.append(message)
@@ -250,31 +258,25 @@ class Connection:
         del buffer[:start]
         return messages
 
-    def _is_one_frame(self, data: bytes) -> bool:
-        """The usual case: these bytes are one whole frame of a kind that may come."""
-        length = len(data) - _HEADER
-        return (
-            length > SEAL_BYTES + 2
-            and data[_HEADER + 1] in self._may_come
-            and int.from_bytes(data[:_HEADER], "big") == length <= LIMITS[data[_HEADER + 1]]
-        )
-
-    def _only(self, data: bytes) -> Message:
+    def _only(self, data: bytes, kind: int) -> Message:
         """The message of one whole frame of an open connection."""
         try:
-            body = data[_HEADER:] if self._seal_in is None else self._unsealed(data[_HEADER:])
-            message = decode(body)
+            body: bytes | memoryview = data[_HEADER:]
+            if self._seal_in is not None:
+                body = self._unsealed(data[_HEADER:])
+            message = decode_kind(body, kind) if body[0] & 0xF0 == 0x90 else decode(body)
         except ProtocolError:
             self._enter(_Phase.CLOSED)
             raise
-        if message.KIND in _LAST:
+        if kind in _LAST:
             self._enter(_Phase.CLOSED)
         return message
 
-    def _unsealed(self, body: bytes) -> bytes:
+    def _unsealed(self, sealed: bytes) -> bytes | memoryview:
         assert self._seal_in is not None
-        body, tag = body[:-SEAL_BYTES], body[-SEAL_BYTES:]
-        if not same(tag, self._seal_in.next(body)):
+        # A large body is not copied again to be taken apart.
+        body = memoryview(sealed)[:-SEAL_BYTES] if len(sealed) > _LARGE else sealed[:-SEAL_BYTES]
+        if not same(sealed[-SEAL_BYTES:], self._seal_in.next(body)):
             raise ProtocolError("bad_seal", "a frame was changed, repeated, lost or made without the key")
         return body
 
@@ -297,9 +299,7 @@ class Connection:
         return start + _HEADER + length if have >= length else 0
 
     def _take(self, body: bytes) -> Message | None:
-        if self._seal_in is not None:
-            body = self._unsealed(body)
-        message = decode(body)
+        message = decode(body if self._seal_in is None else self._unsealed(body))
         if self._phase is not _Phase.OPEN:
             return self._take_opening(message, body)
         if message.KIND in _LAST:

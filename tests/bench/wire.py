@@ -3,8 +3,9 @@
     python tests/bench/wire.py                       # all that is installed
     python tests/bench/wire.py --quick --json out.json
 
-Rounds are interleaved, so that a busy machine is busy for all. Each server is a process of its own; with `--pin` (the
-default where it is permitted) both ends are SCHED_FIFO on different cores. Ratios are what counts: microseconds are this machine's.
+Contenders take turns every few calls, so that a busy machine is busy for all. Each server is a process of its own; with
+`--pin` (the default where it is permitted) both ends are SCHED_FIFO on different cores. Ratios are what counts:
+microseconds are this machine's.
 """
 
 from __future__ import annotations
@@ -32,6 +33,11 @@ from tests.bench.wire_contenders import CONTENDERS, HOST, Bare, Contender, Petro
 RATES = (100, 250, 1000)
 IN_FLIGHT = 64
 BIG = 100_000
+GAP = 0.001
+"""Seconds between spaced calls: the other end sleeps by then."""
+ROWS = ("call", "spaced", "round p50", "spaced p50", "big", "rate")
+TURN = 20
+"""Calls of one contender before the next has its turn."""
 RAW, STREAM = "raw socket", "petrobot stream"
 
 
@@ -73,16 +79,26 @@ class Table:
             one.latencies(200, 0)
 
     def measure(self, rounds: int, calls: int) -> None:
-        """Interleaved rounds of all."""
+        """Rounds of all; within a round they take turns every few calls, so that the machine is in one mood for all."""
         for number in range(rounds):
+            taken = self._take_turns(calls, 0.0)
+            spaced = self._take_turns(calls // 4, GAP)
             for one in self._contenders:
-                row = self.rows.setdefault(one.name, {"call": [], "big": [], "rate": [], "round p50": []})
-                taken = one.latencies(calls, 0)
-                row["call"] += taken
-                row["round p50"].append(quantile(taken, 0.5))
+                row = self.rows.setdefault(one.name, {name: [] for name in ROWS})
+                row["call"] += taken[one.name]
+                row["spaced"] += spaced[one.name]
+                row["round p50"].append(quantile(taken[one.name], 0.5))
+                row["spaced p50"].append(quantile(spaced[one.name], 0.5))
                 row["big"] += one.latencies(max(calls // 20, 20), BIG)
                 row["rate"].append(one.rate(max(calls // IN_FLIGHT, 4) * IN_FLIGHT, IN_FLIGHT))
             print(f"round {number + 1} of {rounds} done", file=sys.stderr)
+
+    def _take_turns(self, calls: int, gap: float) -> dict[str, list[float]]:
+        taken: dict[str, list[float]] = {one.name: [] for one in self._contenders}
+        for _ in range(max(calls // TURN, 1)):
+            for one in self._contenders:
+                taken[one.name] += one.latencies(TURN, 0, gap)
+        return taken
 
     def close(self) -> None:
         """End all servers."""
@@ -96,11 +112,16 @@ class Table:
         bare = self.rows[Bare.name]
         found = {}
         for name, row in self.rows.items():
-            ratios = [own / its for own, its in zip(row["round p50"], bare["round p50"], strict=True)]
+            ratio, spaced = (
+                quantile([own / its for own, its in zip(row[p50], bare[p50], strict=True)], 0.5)
+                for p50 in ("round p50", "spaced p50")
+            )
             found[name] = {
                 "p50_us": quantile(row["call"], 0.5) * 1e6,
                 "p99_us": quantile(row["call"], 0.99) * 1e6,
-                "ratio_to_bare": quantile(ratios, 0.5),
+                "to_bare": ratio,
+                "spaced_p50_us": quantile(row["spaced"], 0.5) * 1e6,
+                "spaced_to_bare": spaced,
                 "big_p50_us": quantile(row["big"], 0.5) * 1e6,
                 "calls_per_s": quantile(row["rate"], 0.5),
             }
@@ -221,8 +242,10 @@ def verdicts(calls: dict[str, dict[str, float]]) -> dict[str, Any]:
     """The goals, and whether this run met them."""
     ours, sealed = calls[Petrobot.name], calls[PetrobotSealed.name]
     goals: dict[str, Any] = {
-        "p50 <= 1.6 x bare echo": ours["ratio_to_bare"],
-        "p50 <= 2.0 x bare echo with MAC": sealed["ratio_to_bare"],
+        "p50 <= 1.6 x bare echo": ours["to_bare"],
+        "p50 <= 1.6 x bare echo, spaced calls": ours["spaced_to_bare"],
+        "p50 <= 2.0 x bare echo with MAC": sealed["to_bare"],
+        "p50 <= 2.0 x bare echo with MAC, spaced": sealed["spaced_to_bare"],
     }
     for peer in ("Pyro5", "RPyC"):
         if peer in calls:

@@ -42,8 +42,11 @@ class Contender:
         """Be ready to ask the service on this port."""
         raise NotImplementedError
 
-    def latencies(self, count: int, size: int) -> list[float]:
-        """Seconds of each of `count` calls, one after the other, with a record (size 0) or so many bytes."""
+    def latencies(self, count: int, size: int, gap: float = 0.0) -> list[float]:
+        """Seconds of each of `count` calls, one after the other, with a record (size 0) or so many bytes.
+
+        With a `gap` (s) each call finds the other end asleep, as a call now and then does; without, both stay awake.
+        """
         raise NotImplementedError
 
     def rate(self, count: int, in_flight: int) -> float:
@@ -87,10 +90,11 @@ class AsyncContender(Contender):
     def connect(self, port: int) -> None:
         self.runner.run(self.open(port))
 
-    def latencies(self, count: int, size: int) -> list[float]:
+    def latencies(self, count: int, size: int, gap: float = 0.0) -> list[float]:
         async def run() -> list[float]:
             value, taken, clock = payload(size), [], time.perf_counter
             for _ in range(count):
+                time.sleep(gap)
                 began = clock()
                 await self.ask(value)
                 taken.append(clock() - began)
@@ -119,28 +123,30 @@ class AsyncContender(Contender):
         return asyncio.sleep(0)
 
 
-class _Echo(asyncio.Protocol):
+class _Echo:
     """Sends back what comes."""
+
+    transport: asyncio.Transport
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
         self.transport = transport
         transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
-    def data_received(self, data: bytes) -> None:
+    def take(self, data: bytes) -> None:
         self.transport.write(data)
 
 
 class _Asker(_Echo):
     """Counts the bytes that come back; knows no more of the protocol."""
 
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        super().connection_made(transport)
+    def __init__(self) -> None:
+        super().__init__()
         self.loop = asyncio.get_running_loop()
         self.have = 0
         self.waiting: list[tuple[int, asyncio.Future[None]]] = []
 
-    def data_received(self, data: bytes) -> None:
+    def take(self, data: bytes) -> None:
         self.have += len(data)
         while self.waiting and self.have >= self.waiting[0][0]:
             size, future = self.waiting.pop(0)
@@ -154,24 +160,65 @@ class _Asker(_Echo):
         return future
 
 
+class _Streamed(_Echo, asyncio.Protocol):
+    def data_received(self, data: bytes) -> None:
+        self.take(data)
+
+
+class _StreamedAsker(_Asker, asyncio.Protocol):
+    def data_received(self, data: bytes) -> None:
+        self.take(data)
+
+
+class _Buffered(_Echo, asyncio.BufferedProtocol):
+    BUFFER = bytearray(1 << 18)
+
+    def get_buffer(self, sizehint: int) -> bytearray:
+        return self.BUFFER
+
+    def buffer_updated(self, nbytes: int) -> None:
+        self.take(bytes(memoryview(self.BUFFER)[:nbytes]))
+
+
+class _BufferedAsker(_Asker, asyncio.BufferedProtocol):
+    BUFFER = bytearray(1 << 18)
+
+    def get_buffer(self, sizehint: int) -> bytearray:
+        return self.BUFFER
+
+    def buffer_updated(self, nbytes: int) -> None:
+        self.take(bytes(memoryview(self.BUFFER)[:nbytes]))
+
+
 class Bare(AsyncContender):
     """asyncio alone: the bytes of our own frame are sent back as they came. The measure of all others."""
 
     name = "bare asyncio echo"
     FRAME = bytes(170)
+    echo: ClassVar[Any] = _Streamed
+    asker: ClassVar[Any] = _StreamedAsker
 
     async def start(self) -> int:
-        self.server = await asyncio.get_running_loop().create_server(_Echo, HOST, 0)
+        self.server = await asyncio.get_running_loop().create_server(self.echo, HOST, 0)
         return int(self.server.sockets[0].getsockname()[1])
 
     async def open(self, port: int) -> None:
-        _, self.asker = await asyncio.get_running_loop().create_connection(_Asker, HOST, port)
+        _, self.link = await asyncio.get_running_loop().create_connection(self.asker, HOST, port)
 
     def ask(self, value: Any) -> Awaitable[Any]:
-        return self.asker.ask(value if isinstance(value, bytes) else self.FRAME)
+        answer: Awaitable[Any] = self.link.ask(value if isinstance(value, bytes) else self.FRAME)
+        return answer
 
     async def leave(self) -> None:
-        self.asker.transport.close()
+        self.link.transport.close()
+
+
+class BareBuffered(Bare):
+    """The same with `asyncio.BufferedProtocol`, which spares a fresh buffer of 256 KiB for each read."""
+
+    name = "bare, buffered protocol"
+    echo = _Buffered
+    asker = _BufferedAsker
 
 
 class Petrobot(AsyncContender):
@@ -239,9 +286,10 @@ class Pyro(Contender):
             self.own.proxy = self.api.Proxy(self.uri)
         return self.own.proxy
 
-    def latencies(self, count: int, size: int) -> list[float]:
+    def latencies(self, count: int, size: int, gap: float = 0.0) -> list[float]:
         value, proxy, taken = payload(size), self._proxy(), []
         for _ in range(count):
+            time.sleep(gap)
             began = time.perf_counter()
             proxy.echo(value)
             taken.append(time.perf_counter() - began)
@@ -283,9 +331,10 @@ class Rpyc(Contender):
         self.link = self.rpyc.connect(HOST, port)
         self.record = (RECORD["name"], tuple(RECORD["value"]), RECORD["text"])
 
-    def latencies(self, count: int, size: int) -> list[float]:
+    def latencies(self, count: int, size: int, gap: float = 0.0) -> list[float]:
         value, echo, taken = bytes(size) if size else self.record, self.link.root.echo, []
         for _ in range(count):
+            time.sleep(gap)
             began = time.perf_counter()
             echo(value)
             taken.append(time.perf_counter() - began)
@@ -391,4 +440,4 @@ class Grpc(AsyncContender):
         await self.channel.close()
 
 
-CONTENDERS: list[type[Contender]] = [Bare, Petrobot, PetrobotSealed, Pyro, Rpyc, Zmq, Grpc]
+CONTENDERS: list[type[Contender]] = [Bare, BareBuffered, Petrobot, PetrobotSealed, Pyro, Rpyc, Zmq, Grpc]

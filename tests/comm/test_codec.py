@@ -11,6 +11,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from services.comm import codec
 from services.comm import messages as m
 from services.comm.canbus import Frame
 from services.comm.codec import LIMITS, MAX_CONTAINERS, NAME_LENGTH, ProtocolError, decode, encode
@@ -189,6 +190,29 @@ def test_trailing_fields_may_be_left_out_and_a_duration_may_be_whole(fields: lis
     found = decode(msgpack.packb(fields))
     assert found == message
     assert decode(encode(found)) == message
+
+
+_odd: st.SearchStrategy[Any] = st.sampled_from(
+    [None, True, 0, 1, -1, 2**63, 1.0, -1.0, math.nan, math.inf, "", "x", "no", b"", [], {}, {"a": [1]}]
+)
+
+
+@given(st.sampled_from([4, 7]), st.lists(_odd, min_size=8, max_size=8), st.lists(st.booleans(), min_size=8, max_size=8))
+def test_the_quick_way_says_what_the_table_says(kind: int, odd: list[Any], use: list[bool]) -> None:
+    usual = CALL if kind == 4 else [7, "c1", "success", {}, "", "", "yes", 0.0, 0.0]
+    fields = [kind, *(new if used else old for new, used, old in zip(odd, use, usual[1:], strict=True))]
+    body = msgpack.packb(fields)
+    assert _told(body) == _told(body, quick=False)
+
+
+def _told(body: bytes, quick: bool = True) -> str:
+    with pytest.MonkeyPatch.context() as patch:
+        if not quick:
+            patch.setattr(codec, "_QUICK", {})
+        try:
+            return repr(decode(body))
+        except ProtocolError as fault:
+            return str(fault)
 
 
 @pytest.mark.parametrize("depth", [1, DEPTH - 1, DEPTH])

@@ -460,7 +460,7 @@ def test_the_heart_pings_then_gives_up() -> None:
 def test_what_is_heard_puts_the_end_off() -> None:
     heart = Heart(0.0, Timing())
     for tick in range(1, 40):
-        heart.hear(tick * 0.25 - 0.1)
+        heart.heard = tick * 0.25 - 0.1
         assert heart.advance(heart.due()) is Beat.NOTHING
     assert heart.due() == pytest.approx(10.0)
 
