@@ -146,7 +146,9 @@ class Connection:
         self._key = key
         self._nonce = nonce
         self._phase = _Phase.HELLO
-        self._buffer = bytearray()
+        self._parts: list[bytes] = []
+        self._have = 0
+        self._need = 0
         self._out = bytearray()
         self._hello: Hello | None = None
         self._transcript = b""
@@ -232,30 +234,38 @@ class Connection:
         Raises ProtocolError when the other side broke the protocol: the connection is closed then, and what came well
         before the fault is in the error's `before`.
         """
-        messages: list[Message] = []
         if self._phase in (_Phase.CLOSING, _Phase.CLOSED):
-            return messages
-        buffer = self._buffer
-        if not buffer and self._phase is _Phase.OPEN and len(data) > _HEADER + SEAL_BYTES + 2:
+            return []
+        if self._parts:
+            self._parts.append(data)
+            self._have += len(data)
+            if self._have < self._need:
+                return []
+            data = b"".join(self._parts)
+            self._parts.clear()
+        elif self._phase is _Phase.OPEN and len(data) > _HEADER + SEAL_BYTES + 2:
             # The usual case: these bytes are one whole frame of a kind that may come.
             kind, length = data[_HEADER + 1], len(data) - _HEADER
             if kind in self._may_come and int.from_bytes(data[:_HEADER], "big") == length <= LIMITS[kind]:
                 return [self._only(data, kind)]
-        buffer += data
+        return self._frames(data)
+
+    def _frames(self, data: bytes) -> list[Message]:
+        """Messages of the whole frames in these bytes; what is left waits for more, in parts, so that nothing is moved twice."""
+        messages: list[Message] = []
         start = 0
         try:
-            while self.state is not State.CLOSED and (end := self._frame_end(start)):
-                with memoryview(buffer) as view:
-                    body = bytes(view[start + _HEADER : end])
-                message = self._take(body)
+            while self.state is not State.CLOSED and (end := self._frame_end(data, start)):
+                message = self._take(data[start + _HEADER : end])
                 start = end
                 if message is not None:
                     messages.append(message)
         except ProtocolError as fault:
             self._enter(_Phase.CLOSED)
-            buffer.clear()
             raise ProtocolError(fault.code, fault.text, messages) from None
-        del buffer[:start]
+        if start < len(data):
+            self._parts.append(data[start:] if start else data)
+            self._have = len(data) - start
         return messages
 
     def _only(self, data: bytes, kind: int) -> Message:
@@ -280,23 +290,25 @@ class Connection:
             raise ProtocolError("bad_seal", "a frame was changed, repeated, lost or made without the key")
         return body
 
-    def _frame_end(self, start: int) -> int:
-        """Where the frame that begins at `start` ends; 0 if it is not there yet. Refuses a bad one as early as it can."""
-        buffer = self._buffer
-        have = len(buffer) - start - _HEADER
-        if have < 0:
+    def _frame_end(self, data: bytes, start: int) -> int:
+        """Where the frame that begins at `start` ends; 0 if it is not all there. Refuses a bad one as early as it can."""
+        body = start + _HEADER
+        self._need = _HEADER + 2
+        if len(data) < body + 2:
+            if len(data) >= body and int.from_bytes(data[start:body], "big") < 2:
+                raise ProtocolError("malformed", "a frame without a message")
             return 0
-        length = int.from_bytes(buffer[start : start + _HEADER], "big")
+        length = int.from_bytes(data[start:body], "big")
         sealed = SEAL_BYTES if self._seal_in is not None else 0
         if length < 2 + sealed:
             raise ProtocolError("malformed", f"a frame of {length} bytes")
-        if have >= 2:
-            kind = kind_of(buffer[start + _HEADER : start + _HEADER + 2])
-            if kind not in self._may_come:
-                raise ProtocolError("out_of_turn", f"kind {kind} cannot come while {self._phase.value}")
-            if length > LIMITS[kind] + sealed:
-                raise ProtocolError("too_large", f"kind {kind}: {length} bytes are above the limit of {LIMITS[kind]}")
-        return start + _HEADER + length if have >= length else 0
+        kind = kind_of(data[body : body + 2])
+        if kind not in self._may_come:
+            raise ProtocolError("out_of_turn", f"kind {kind} cannot come while {self._phase.value}")
+        if length > LIMITS[kind] + sealed:
+            raise ProtocolError("too_large", f"kind {kind}: {length} bytes are above the limit of {LIMITS[kind]}")
+        self._need = _HEADER + length
+        return body + length if len(data) >= body + length else 0
 
     def _take(self, body: bytes) -> Message | None:
         message = decode(body if self._seal_in is None else self._unsealed(body))
