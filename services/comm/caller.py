@@ -5,19 +5,8 @@ Used alike in real time (`client.py` drives it) and in lock step (its messages t
 - Every call ends with exactly one `Ended`, whatever happens to the link or the peer.
 - No call is ever made again under another id. After a lost link the same call is sent again under the same id to the same
   boot of the peer, which knows the id and runs it at most once; another boot is never sent it.
-- What the caller decides by itself is ERROR with a cause: executed = no where the call never left, unknown otherwise.
-
-| cause | executed | when |
-|---|---|---|
-| unreachable | no * | the peer is away and was not sent the call |
-| refused | no * | the peer refuses the connection; unknown for what it was sent before |
-| lost | unknown | the link broke and did not come back in time |
-| rebooted | unknown | the peer came back as another boot |
-| not_accepted | unknown | neither ACCEPT nor RESULT in time; cancelled |
-| no_answer | unknown | deadline or cancel long over and no RESULT; cancelled |
-| cancelled | no | cancelled before it left |
-
-* unknown if the owner names the boot that the call was meant for: then it may have been sent before a restart of the owner.
+- What the caller decides by itself is ERROR with a cause (the table in docs/protocol.md): executed = no where the call never
+  left, unknown otherwise, also when its owner names the boot it was meant for: he may have sent it before he was restarted.
 """
 
 from __future__ import annotations

@@ -28,7 +28,8 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from services.comm.stream import Incoming, StreamReceiver, StreamSender
-from tests.bench.wire_contenders import CONTENDERS, HOST, Bare, Contender, Petrobot, PetrobotSealed
+from tests.bench.wire_contenders import HOST, Bare, Contender, Petrobot, PetrobotSealed
+from tests.bench.wire_peers import CONTENDERS
 
 RATES = (100, 250, 1000)
 IN_FLIGHT = 64
