@@ -82,6 +82,12 @@ def test_sound_task_has_no_finding(task: Tasks) -> None:
             lambda t: t("a!2=2 x=1", {"t": {"in": "a:normal x"}, "u": {"in": "a:error x"}}),
         ),
         (
+            "unsettled-conflict",
+            E,
+            "transitions.t",
+            lambda t: t("x=1 y=2", {"t": {"in": "x !y*3"}, "u": {"in": "x y"}}),
+        ),
+        (
             "arrival-order",
             N,
             "transitions.t",

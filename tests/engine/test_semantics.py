@@ -1,4 +1,4 @@
-"""The semantics by table: branches, events, conditions, steps, conflicts, timers, servers, results."""
+"""The semantics by table: branches, events, conditions, timers, servers, results, the end."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from coordinator.conditions import parse
 from coordinator.engine import (
     ArmTimer,
     Begin,
@@ -17,13 +18,11 @@ from coordinator.engine import (
     EventOccurred,
     Finished,
     Fired,
-    Mode,
     Policy,
     RunEnded,
     RunRaised,
     RunRecorded,
     StartRun,
-    Subject,
     TimerFired,
     VariableChanged,
     Verdict,
@@ -214,148 +213,6 @@ def test_unwritten_name_makes_a_condition_false_and_is_reported(play: Plays) -> 
     assert p.fired == ["t"]
 
 
-def test_event_free_transitions_follow_until_stable(play: Plays) -> None:
-    p = play("x=1 y z", {"t": {"in": "x", "out": "y"}, "u": {"in": "y", "out": "z"}})
-    assert p.fired == ["t", "u"] and p.marked == {"z": 1}
-
-
-def test_timeless_cycle_pauses(play: Plays) -> None:
-    p = play("x=1 y", {"t": {"in": "x", "out": "y"}, "u": {"in": "y", "out": "x"}}, policy=Policy(firing_limit=10))
-    assert len(p.fired) == 10 and p.state.mode is Mode.PAUSED and p.reports == ["timeless"]
-
-
-def test_time_between_stimuli_makes_firings_no_cycle(play: Plays) -> None:
-    net = {"t": {"in": "x", "out": "y", "event": "e"}, "u": {"in": "y", "out": "z"}, "v": {"in": "z", "out": "x"}}
-    p = play("x=1 y z", net, "e", policy=Policy(firing_limit=4))
-    p(EventOccurred("e"), EventOccurred("e"))
-    assert len(p.fired) == 6 and p.reports == []
-
-
-def test_step_orders_transitions_so_that_none_bars_the_next(play: Plays) -> None:
-    net = {
-        "t": {"in": "x", "out": "y", "event": "e"},
-        "u": {"in": "v !y", "out": "z", "event": "e"},
-        "w": {"in": "r !z", "event": "e"},
-    }
-    p = play("x=1 y v=1 z r=1", net, "e")
-    p(EventOccurred("e"))
-    assert p.fired == ["w", "u", "t"]
-
-
-def test_step_is_judged_on_one_marking(play: Plays) -> None:
-    net = {"t": {"in": "x !y", "out": "z", "event": "e"}, "u": {"in": "w", "out": "y", "event": "e"}}
-    p = play("x=1 y w=1 z", net, events="e")
-    p(EventOccurred("e"))
-    assert p.fired == ["t", "u"] and p.marked == {"z": 1, "y": 1}
-
-
-def test_conflict_settled_by_priority(play: Plays) -> None:
-    net = {"t": {"in": "x", "out": "y", "event": "e"}, "u": {"in": "x", "out": "z", "event": "e", "priority": 1}}
-    p = play("x=1 y z", net, events="e")
-    p(EventOccurred("e"))
-    assert p.fired == ["u"] and p.reports == []
-
-
-def test_priority_settles_conflicts_alone(play: Plays) -> None:
-    net = {"t": {"in": "x", "out": "y", "event": "e"}, "u": {"in": "w", "out": "z", "event": "e", "priority": 1}}
-    p = play("x=1 w=1 y z", net, events="e")
-    p(EventOccurred("e"))
-    assert sorted(p.fired) == ["t", "u"]
-
-
-def test_conflict_drawn_by_weight(play: Plays) -> None:
-    net = {
-        "t": {"in": "x", "out": "y", "event": "e", "weight": 1.0},
-        "u": {"in": "x", "out": "z", "event": "e", "weight": 3.0},
-    }
-    p = play("x=1 y z", net, events="e")
-    (choose,) = p(EventOccurred("e"))
-    assert (choose.subject, choose.alternatives, choose.weights) == (Subject.CONFLICT, ("t", "u"), (1.0, 3.0))
-    assert p.fired == []
-    p(Chosen(choose.key, "w"))
-    assert p.reports == ["bad_choice"] and p.fired == []
-    p(Chosen(choose.key, "u", "draw 0.4"))
-    assert p.fired == ["u"] and p.marked == {"z": 1}
-
-
-def test_what_does_not_conflict_fires_in_the_same_step_as_the_drawn_one(play: Plays) -> None:
-    net = {
-        "t": {"in": "x", "out": "y", "event": "e", "weight": 1.0},
-        "u": {"in": "x", "out": "z", "event": "e", "weight": 1.0},
-        "v": {"in": "w", "out": "z", "event": "e"},
-    }
-    p = play("x=1 w=1 y z", net, events="e")
-    (choose,) = p(EventOccurred("e"))
-    p(Chosen(choose.key, "t"))
-    assert sorted(p.fired) == ["t", "v"] and {f.cause for f in p.of(Fired)} == {"EventOccurred"}
-
-
-def test_three_takers_of_two_tokens_are_drawn_one_after_the_other(play: Plays) -> None:
-    net = {n: {"in": "x", "out": n + "1", "event": "e", "weight": 1.0} for n in ("t", "u", "v")}
-    p = play("x=2 t1 u1 v1", net, events="e")
-    (first,) = p(EventOccurred("e"))
-    assert first.alternatives == ("t", "u", "v")
-    (second,) = p(Chosen(first.key, "v"))
-    assert second.alternatives == ("t", "u") and second.key != first.key
-    p(Chosen(second.key, "u"))
-    assert sorted(p.fired) == ["u", "v"] and p.marked == {"u1": 1, "v1": 1}
-
-
-def test_stimuli_wait_while_a_draw_is_outstanding(play: Plays) -> None:
-    net = {
-        "t": {"in": "x", "out": "y", "event": "e", "weight": 1.0},
-        "u": {"in": "x", "out": "z", "event": "e", "weight": 1.0},
-        "v": {"in": "y", "out": "w", "event": "e"},
-    }
-    p = play("x=1 y z w", net, events="e")
-    (choose,) = p(EventOccurred("e"))
-    p(EventOccurred("e"))
-    assert len(p.state.backlog) == 1
-    p(Chosen(choose.key, "t"))
-    assert p.fired == ["t", "v"] and p.state.backlog == ()
-
-
-def test_undecided_conflict_goes_by_file_order_and_is_reported(play: Plays) -> None:
-    net = {"t": {"in": "x", "out": "y", "event": "e"}, "u": {"in": "x", "out": "z", "event": "e"}}
-    p = play("x=1 y z", net, events="e")
-    p(EventOccurred("e"))
-    assert p.fired == ["t"] and p.reports == ["undecided"]
-
-
-def test_exclusive_conditions_are_no_conflict(play: Plays) -> None:
-    net = {
-        "t": {"in": "x", "out": "y", "event": "e", "when": "n > 3"},
-        "u": {"in": "x", "out": "z", "event": "e", "when": "n <= 3"},
-    }
-    p = play("x=1 y z", net, events="e", variables={"n": 4})
-    p(EventOccurred("e"))
-    assert p.fired == ["t"] and p.reports == []
-
-
-def test_one_latched_event_serves_one_of_two(play: Plays) -> None:
-    net = {"t": {"in": "x", "out": "y", "event": "e"}, "u": {"in": "w", "out": "z", "event": "e", "priority": 1}}
-    p = play("x=1 w=1 y z", net, events="e*")
-    p(EventOccurred("e"))
-    assert p.fired == ["u"]
-    p(EventOccurred("e"))
-    assert p.fired == ["u", "t"]
-
-
-def test_mutual_inhibition_is_a_conflict(play: Plays) -> None:
-    net = {"t": {"in": "x !z", "out": "y", "event": "e"}, "u": {"in": "w !y", "out": "z", "event": "e", "priority": 1}}
-    p = play("x=1 w=1 y z", net, events="e")
-    p(EventOccurred("e"))
-    assert p.fired == ["u"]
-
-
-def test_capacity_bars_a_firing_until_there_is_room(play: Plays) -> None:
-    net = {"t": {"in": "x", "out": "y"}, "u": {"in": "y", "event": "e"}}
-    p = play("x=3 y/2", net, "e")
-    assert p.marked == {"x": 1, "y": 2}
-    p(EventOccurred("e"))
-    assert p.fired == ["t", "t", "u", "t"] and p.marked == {"y": 2}
-
-
 def test_after_timer_is_armed_fires_and_is_disarmed(play: Plays) -> None:
     net = {"t": {"in": "x", "out": "y", "event": "e"}, "late": {"in": "x", "out": "z", "after": 2.5}}
     p = play("x=2 y z", net, events="e")
@@ -463,8 +320,6 @@ def test_records_for_the_estimates(play: Plays) -> None:
     ("end", "status", "words"), [(OK, OK, "final"), (ERR, ERR, "given up")], ids=["designed", "honest"]
 )
 def test_the_end(task: Callable[..., Task], play: Plays, end: Status, status: Status, words: str) -> None:
-    from coordinator.conditions import parse
-
     p = play("a!=1 done broken", BRANCHES, final="done == 1", final_error=parse("broken == 1"))
     p(RunEnded("a#1", end))
     assert p.finished is not None and p.finished.status is status and words in p.finished.reason
