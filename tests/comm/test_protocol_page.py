@@ -1,0 +1,67 @@
+"""docs/protocol.md says what the code does: kinds, fields, limits, codes and the example."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+
+import pytest
+
+from services.comm import messages as m
+from services.comm.codec import LIMITS, encode
+from services.comm.link import Timing
+from services.comm.results import Keeping
+from services.comm.under_way import Patience
+
+from .conftest import KINDS
+
+PAGE = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text(encoding="utf-8")
+ROWS = {int(row[1]): row for row in re.finditer(r"^\| (\d+) (\w+) \| (\w+) \| (.*) \| ([\d]+ \w+) \|$", PAGE, re.M)}
+UNITS = {"B": 1, "KiB": 1024, "MiB": 1024 * 1024}
+CODE = "\n".join(path.read_text(encoding="utf-8") for path in (Path(m.__file__).parent).glob("*.py"))
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
+def test_the_table_of_messages(kind: type[m.Message]) -> None:
+    row = ROWS[kind.KIND]
+    fields = [field.name for field in dataclasses.fields(kind)]
+    assert re.findall(r"(\w+) (?:str|int|dur|bool|bytes|map|\*text\*|\[\w+\])(?=[ ,)]|$)", row[4]) == fields
+    required = [
+        field.name
+        for field in dataclasses.fields(kind)
+        if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+    ]
+    assert [name for name in fields if f"({name}" not in row[4]] == required
+    number, unit = row[5].split()
+    assert int(number) * UNITS[unit] == LIMITS[kind.KIND]
+
+
+def test_the_example() -> None:
+    call = m.Call("c1", "track", {"t": 1.5}, 2.0, 3, "b1", "p0", 7)
+    block = PAGE.split("parent `p0`, seed 7:\n```\n")[1].split("```")[0]
+    shown = b"".join(bytes.fromhex(re.split(r"  +", line)[0]) for line in block.splitlines())
+    assert shown == len(encode(call)).to_bytes(4, "big") + encode(call)
+
+
+def test_the_codes_and_causes_are_the_codes() -> None:
+    tables = re.findall(r"^\| ([a-z_, ]+) \|", PAGE, re.M)
+    named = {name for row in tables for name in row.split(", ")} - {"opening", "open", "closing", "closed", "state"}
+    named -= {"code", "cause", "kind", "busy"}
+    assert len(named) > 30
+    assert [name for name in sorted(named) if f'"{name}"' not in CODE] == []
+
+
+def test_the_times() -> None:
+    assert (Timing().heartbeat, Timing().silence, Timing().handshake, Timing().user_timeout) == (0.25, 1.0, 2.0, 1.5)
+    assert (Patience().reconnect, Patience().accept, Patience().stop) == (2.0, 1.0, 5.0)
+    assert (Keeping().results, Keeping().result_count, Keeping().ids, Keeping().lease) == (600.0, 1_000, 3_600.0, 2.0)
+    for said in (
+        "after 0.25 s",
+        "for 1.0 s",
+        "there are 2 s",
+        "(1.5 s)",
+        "for 10 minutes (at most 1,000",
+        "for an hour",
+    ):
+        assert said in PAGE
