@@ -17,7 +17,7 @@ The paper leaves open how boundedness, properness and liveness map to these (sec
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -78,12 +78,12 @@ class RobotVerdicts:
 class Flow:
     """A complete space seen through its roles: masks over markings and edges."""
 
-    def __init__(self, space: Space, roles: Roles, graph: Graph | None = None) -> None:
+    def __init__(self, space: Space, roles: Roles) -> None:
         """Raises ValueError for a space that was cut short: nothing can be promised from a part."""
         if not space.complete:
             raise ValueError(f"the robot's verdicts need all reachable markings; the search stopped: {space.reason}")
         self.space, self.roles = space, roles
-        self.graph = graph or Graph(len(space), space.source, space.target)
+        self.graph = Graph(len(space), space.source, space.target)
         self.nominal: Mask = space.where(roles.nominal)
         self.error = self.fires(roles.error_exits)
         self.free = self.fires(roles.controllable)
@@ -91,9 +91,7 @@ class Flow:
 
     def fires(self, names: frozenset[str]) -> Mask:
         """Which edges fire one of the transitions."""
-        index = self.space.net.transition_index
-        chosen = np.zeros(len(self.space.net.transitions) + 1, dtype=np.bool_)
-        chosen[[index[name] for name in names]] = True
+        chosen = np.array([name in names for name in self.space.net.transitions] or [False])
         return chosen[self.space.label]
 
     def nested(self) -> list[Mask]:
@@ -115,14 +113,20 @@ class Flow:
         return Graph(self.graph.n, self.space.source[kept], self.space.target[kept])
 
 
-def judge(space: Space, roles: Roles, graph: Graph | None = None) -> RobotVerdicts:
-    """Stability, recoverability of every error exit, and controllability on the closed net behind a complete space."""
-    flow = Flow(space, roles, graph)
-    function = lyapunov(space.net)
+def judge(space: Space, roles: Roles, open_space: Space | None = None) -> RobotVerdicts:
+    """Stability, recoverability of every error exit, and controllability, from complete spaces.
+
+    `space` is that of the closed net, in which progress is judged; `open_space` that of the net itself (by default the
+    same), which gives kappa and the Lyapunov function.
+    """
+    flow = Flow(space, roles)
+    open_space = open_space or space
+    alone = Flow(open_space, replace(roles, renewals=frozenset())) if open_space is not space else flow
+    function = lyapunov(open_space.net)
     attracted = _attracted(flow)
     controllable, unforced = _controllable(flow)
     return RobotVerdicts(
-        _stable(space, function, attracted), function, attracted, recoveries(flow), controllable, unforced
+        _stable(open_space, function, attracted), function, attracted, recoveries(flow, alone), controllable, unforced
     )
 
 
@@ -154,9 +158,10 @@ def _attracted(flow: Flow) -> Verdict:
     return Verdict(False, reason, witness(space, first))
 
 
-def recoveries(flow: Flow) -> tuple[Recovery, ...]:
-    """Every error exit that can occur, in transition order."""
-    nested = flow.nested()
+def recoveries(flow: Flow, alone: Flow | None = None) -> tuple[Recovery, ...]:
+    """Every error exit that can occur, in transition order; kappa and strategy from `alone`, the flow of the open net."""
+    alone = alone or flow
+    nested = alone.nested()
     way_back = flow.graph.backward(flow.nominal)
     caught = flow.graph.backward(_outside(flow))
     found = []
@@ -164,7 +169,7 @@ def recoveries(flow: Flow) -> tuple[Recovery, ...]:
         if name in flow.roles.error_exits:
             edges = np.flatnonzero(flow.fires(frozenset({name})))
             if len(edges):
-                found.append(_recovery(flow, name, edges, nested, way_back, caught))
+                found.append(_recovery(flow, alone, name, edges, nested, way_back, caught))
     return tuple(found)
 
 
@@ -177,27 +182,34 @@ def _outside(flow: Flow) -> Mask:
     return outside
 
 
-def _recovery(flow: Flow, name: str, edges: Index, nested: list[Mask], way_back: Mask, caught: Mask) -> Recovery:
-    after = np.unique(flow.space.target[edges]).astype(np.int64)
+def _recovery(
+    flow: Flow, alone: Flow, name: str, edges: Index, nested: list[Mask], way_back: Mask, caught: Mask
+) -> Recovery:
+    back, sure = f"after {name} there is always a way back to", f"after {name} the task always comes back to"
+    kappa, strategy = _kappa(alone, name, nested)
+    return Recovery(
+        name,
+        _every(flow, edges, way_back, f"{back} the nominal flow", "no way back"),
+        _every(flow, edges, ~caught, f"{sure} the nominal flow, with probability 1", "may never come back"),
+        kappa,
+        _resumed(flow, np.unique(flow.space.target[edges]).astype(np.int64)),
+        strategy,
+    )
+
+
+def _kappa(alone: Flow, name: str, nested: list[Mask]) -> tuple[int | None, tuple[str, ...]]:
+    """(index of an error exit, shortest way back inside the set that it guarantees)."""
+    edges = np.flatnonzero(alone.fires(frozenset({name})))
+    first = edges[alone.nominal[alone.space.source[edges]]]
+    after = np.unique(alone.space.target[first if len(first) else edges])
     held = [bool(w[after].all()) for w in nested]
     kappa = None if held[-1] else held.index(False) - 1
     inside = nested[-1 if kappa is None else max(kappa, 0)]
-    usable = inside[flow.space.target] & ~flow.error
-    path = flow.graph.path(int(after[0]), flow.nominal, usable) or flow.graph.path(int(after[0]), flow.nominal) or []
-    return Recovery(
-        name,
-        _every(flow, edges, way_back, f"after {name} there is always a way back to the nominal flow", "no way back"),
-        _every(
-            flow,
-            edges,
-            ~caught,
-            f"after {name} the nominal flow is reached again with probability 1",
-            "may never come back",
-        ),
-        kappa,
-        _resumed(flow, after),
-        tuple(flow.space.net.transitions[flow.space.label[e]] for e in path),
-    )
+    usable = inside[alone.space.target] & ~alone.error
+    path = alone.graph.path(int(after[0]), alone.nominal, usable)
+    if path is None:
+        path = alone.graph.path(int(after[0]), alone.nominal) or []
+    return kappa, tuple(alone.space.net.transitions[alone.space.label[e]] for e in path)
 
 
 def _every(flow: Flow, edges: Index, good: Mask, yes: str, no: str) -> Verdict:

@@ -74,8 +74,16 @@ def test_a_repair_makes_recovery_almost_sure_and_kappa_unlimited() -> None:
     net = arm(2)
     verdicts = judge(explore(net), roles_of(net))
     assert all(r.almost_sure.holds for r in verdicts.recoveries)
-    assert verdicts.stable.holds and verdicts.attracted.holds and verdicts.controllable.holds
+    assert (
+        verdicts.lyapunov is not None
+        and verdicts.stable.holds
+        and verdicts.attracted.holds
+        and verdicts.controllable.holds
+    )
     assert by_name(verdicts.recoveries, "fault").kappa is None
+    alone = judge(explore(net), roles_of(net), explore(arm(2, renewed=False)))
+    assert by_name(alone.recoveries, "fault").kappa == 2 and by_name(alone.recoveries, "give_up").kappa == -1
+    assert by_name(alone.recoveries, "fault").almost_sure.holds
 
 
 def test_a_missing_recovery_is_caught_with_a_witness() -> None:

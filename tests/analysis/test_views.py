@@ -1,0 +1,358 @@
+"""The two views of a task: what each keeps, numbers in closed form, and the shipped tasks with broken variants."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from coordinator.analysis.completion import Completion, completion
+from coordinator.analysis.gspn import Chain
+from coordinator.analysis.markov import visits_before
+from coordinator.analysis.ordinary import OrdinaryView
+from coordinator.analysis.qualitative import examine
+from coordinator.analysis.robot import judge
+from coordinator.analysis.space import Limits, explore
+from coordinator.analysis.stochastic import Measured, NoEstimate, StochasticView, stochastic_view, what_if
+from coordinator.conditions import parse
+from coordinator.task import (
+    Counts,
+    End,
+    Estimate,
+    Event,
+    Inhibitor,
+    Input,
+    Kind,
+    Memory,
+    Output,
+    Place,
+    PrimitiveTask,
+    Scope,
+    Status,
+    Task,
+    Transition,
+)
+from coordinator.taskfile import load
+
+SHIPPED = sorted((Path(__file__).parents[2] / "coordinator" / "tasks").glob("*.toml"))
+EXPONENTIAL = {
+    Status.SUCCESS: Estimate(0.7, 2.0),
+    Status.FAILURE: Estimate(0.2, 3.0),
+    Status.ERROR: Estimate(0.1, 4.0),
+}
+
+
+def action(name: str, estimates: dict[Status, Estimate] | None = None, **more: Any) -> dict[str, Any]:
+    """Primitive task and action place of one name."""
+    known = EXPONENTIAL if estimates is None else estimates
+    primitive = PrimitiveTask(name, f"{name} is done", more.pop("alternatives", ("a",)), 10.0, estimates=known)
+    return {"primitive": primitive, "place": Place(name, Kind.ACTION, task=name, **more)}
+
+
+def task_of(
+    actions: list[dict[str, Any]], others: list[Place], transitions: list[Transition], final: str, **more: Any
+) -> Task:
+    places = [a["place"] for a in actions] + others
+    return Task(
+        "t",
+        {p.name: p for p in places},
+        {t.name: t for t in transitions},
+        {a["primitive"].name: a["primitive"] for a in actions},
+        parse(final),
+        **more,
+    )
+
+
+def taken(place: str, end: End, counts: Counts | None = None) -> Input:
+    return Input(place, 1, end, counts)
+
+
+def one_step(**more: Any) -> Task:
+    """One run from idle: success and failure to done, error back to idle."""
+    return task_of(
+        [action("act", **more)],
+        [Place("idle", Kind.CONTROL, 1), Place("done", Kind.RESOURCE)],
+        [
+            Transition("go", (Input("idle"),), (Output("act"),)),
+            Transition("ok", (taken("act", End.NORMAL),), (Output("done"),)),
+            Transition("again", (taken("act", End.ERROR),), (Output("idle"),)),
+        ],
+        "done == 1",
+    )
+
+
+def completed(task: Task, measured: Measured | None = None, **more: Any) -> tuple[StochasticView, Completion]:
+    view = stochastic_view(task, measured, **more)
+    chain = Chain.of(view.gspn)
+    ordinary = OrdinaryView(task)
+    return view, completion(chain, chain.space.where(ordinary.is_final) & ~chain.vanishing)
+
+
+def test_preselection_gives_the_mean_of_the_mixture() -> None:
+    view, done = completed(one_step())
+    assert done.probability == pytest.approx(1.0)
+    assert done.mean == pytest.approx((0.7 * 2 + 0.2 * 3 + 0.1 * 4) / 0.9)
+    assert view.fit_errors["act.a.success"] == pytest.approx(0.0, abs=1e-9)
+    assert any("declared estimates" in text for text in view.assumptions)
+
+
+def test_measured_runs_choices_and_no_declared_estimates() -> None:
+    task = one_step(estimates={}, alternatives=("slow", "fast"))
+    with pytest.raises(NoEstimate, match="no run of slow was measured"):
+        stochastic_view(task)
+    runs = {
+        ("act", "slow"): {Status.SUCCESS: Estimate(1.0, 4.0)},
+        ("act", "fast"): {Status.SUCCESS: Estimate(1.0, 1.0, 0.5)},
+    }
+    view, done = completed(task, Measured(runs, {"act": {"slow": 0.25, "fast": 0.75}}))
+    assert done.mean == pytest.approx(0.25 * 4 + 0.75 * 1) and view.assumptions == ()
+    assert done.variance == pytest.approx(0.25 * 32 + 0.75 * 1.25 - done.mean**2)
+    _, even = completed(task, Measured(runs))
+    assert even.mean == pytest.approx(2.5)
+
+
+def test_a_preempting_event_races_with_the_run() -> None:
+    """P(event first) = mean / (mean + wait) for one exponential run; what is left of the run vanishes."""
+    task = one_step(estimates={Status.SUCCESS: Estimate(1.0, 2.0, 1.0)})
+    caught = Transition("caught", (taken("act", End.PREEMPT, Counts.SUCCESS),), (Output("done"),), events=("hit",))
+    task = replace(
+        task,
+        transitions={**task.transitions, "caught": caught},
+        events={"hit": Event("hit", Scope.EXTERNAL, Memory.LATCHED, mean_wait=3.0)},
+        goal_transitions=("caught",),
+    )
+    view, done = completed(task)
+    assert done.mean == pytest.approx(1 / (1 / 2 + 1 / 3))
+    transient = (done.h > 0) & ~done.goal
+    flow = visits_before(done.chain, transient)[done.chain.source] * done.chain.probability
+    hits = [done.chain.gspn.net.transition_index[case] for case in view.cases["caught"]]
+    assert flow[np.isin(done.chain.label, hits)].sum() == pytest.approx(2 / 5)
+    assert not done.chain.space.bounds[done.chain.space.net.place_index["act.begin"]] > 1
+    steady = replace(task.primitive_tasks["act"], estimates={Status.SUCCESS: Estimate(1.0, 2.0, 0.0)})
+    _, fixed = completed(replace(task, primitive_tasks={"act": steady}), stages=64)
+    assert fixed.mean == pytest.approx(3 * (1 - np.exp(-2 / 3)), rel=5e-3)
+
+
+def test_a_timer_is_set_back_when_its_transition_is_disabled() -> None:
+    """A token bounces between waiting and away; the timer of 1 s only counts unbroken waiting."""
+    task = task_of(
+        [],
+        [Place("wait", Kind.CONTROL, 1), Place("away", Kind.CONTROL), Place("done", Kind.CONTROL)],
+        [
+            Transition("leave", (Input("wait"),), (Output("away"),), events=("out",)),
+            Transition("back", (Input("away"),), (Output("wait"),), events=("in",)),
+            Transition("late", (Input("wait"),), (Output("done"),), after=1.0),
+        ],
+        "done == 1",
+        events={n: Event(n, Scope.EXTERNAL, mean_wait=w) for n, w in (("out", 0.5), ("in", 0.1))},
+    )
+    k, rate = 64, 2.0
+    stay = (k / (k + rate)) ** k
+    mean_stay = (1 - stay) / rate
+    view, done = completed(task, timer_stages=k)
+    assert done.mean == pytest.approx((mean_stay + (1 - stay) * 0.1) / stay, rel=1e-9)
+    assert view.fit_errors["late.after"] > 0
+    _, once = completed(task, timer_stages=1)
+    assert once.mean == pytest.approx((1 / 3 + 2 / 3 * 0.1) * 3)
+
+
+def test_servers_let_runs_go_on_side_by_side_and_the_others_queue() -> None:
+    def mean(servers: int) -> float:
+        steps = action("act", {Status.SUCCESS: Estimate(1.0, 1.0)}, servers=servers)
+        task = task_of(
+            [steps],
+            [Place("jobs", Kind.CONTROL, 3), Place("done", Kind.CONTROL)],
+            [
+                Transition("go", (Input("jobs"),), (Output("act"),)),
+                Transition("ok", (taken("act", End.NORMAL),), (Output("done"),)),
+                Transition("bad", (taken("act", End.ERROR),), (Output("jobs"),)),
+            ],
+            "done == 3",
+        )
+        return completed(task)[1].mean
+
+    assert [mean(k) for k in (1, 2, 3)] == pytest.approx([3.0, 2.0, 1 + 1 / 2 + 1 / 3])
+
+
+def test_conditions_on_statuses_choose_their_branch_and_others_are_switches() -> None:
+    task = one_step(estimates={Status.SUCCESS: Estimate(0.75, 1.0), Status.FAILURE: Estimate(0.25, 1.0)})
+    places = {**task.places, "poor": Place("poor", Kind.RESOURCE)}
+    good, poor = (
+        Transition(n, (taken("act", End.NORMAL),), (Output(p),), when=parse(f'act.status == "{s}"'))
+        for n, p, s in (("ok", "done", "success"), ("soso", "poor", "failure"))
+    )
+    split = replace(task, places=places, transitions={**task.transitions, "ok": good, "soso": poor})
+    assert completed(split)[1].probability == pytest.approx(0.75)
+    either = {
+        **task.transitions,
+        "ok": replace(good, when=parse("seen")),
+        "soso": replace(poor, when=parse("not seen")),
+    }
+    free = replace(split, transitions=either)
+    view, done = completed(free)
+    assert done.probability == pytest.approx(0.5) and any("condition" in text for text in view.assumptions)
+    assert completed(free, Measured(switches={"ok": 0.9, "soso": 0.1}))[1].probability == pytest.approx(0.9)
+
+
+def test_what_cannot_be_told_is_refused_with_a_remedy() -> None:
+    task = one_step()
+    waits = replace(
+        task,
+        transitions={**task.transitions, "go": replace(task.transitions["go"], events=("tick",))},
+        events={"tick": Event("tick", Scope.EXTERNAL)},
+    )
+    with pytest.raises(NoEstimate, match="add mean_wait"):
+        stochastic_view(waits)
+    with pytest.raises(NoEstimate, match="positive"):
+        stochastic_view(one_step(estimates={Status.SUCCESS: Estimate(1.0, 0.0)}))
+    several = one_step(servers=2)
+    stop = Transition("stop", (taken("act", End.PREEMPT, Counts.NONE),), (Output("idle"),), events=("tick",))
+    with pytest.raises(ValueError, match="one server for the forecast"):
+        stochastic_view(replace(several, transitions={**several.transitions, "stop": stop}))
+
+
+def test_what_if_tokens_change() -> None:
+    task = load(SHIPPED[0])
+    view = stochastic_view(task, stages=1, timer_stages=1)
+    ordinary = OrdinaryView(task)
+    means = []
+    for runs in (1, 2):
+        chain = Chain.of(what_if(view, {"runs": runs}).gspn)
+        means.append(completion(chain, chain.space.where(ordinary.is_final) & ~chain.vanishing).mean)
+    assert means[1] == pytest.approx(2 * means[0], rel=1e-3)
+    with pytest.raises(ValueError, match="no resource or control place"):
+        what_if(view, {"locate_ball": 1})
+
+
+@st.composite
+def tasks(draw: st.DrawFn) -> Task:
+    """Random tasks of two or three actions with joins, going and preempt arcs, inhibitors, timers and events."""
+    names = [f"a{i}" for i in range(draw(st.integers(1, 3)))]
+    controls = [
+        Place(f"c{i}", Kind.CONTROL, draw(st.integers(0, 2)), capacity=draw(st.sampled_from([None, 3])))
+        for i in range(3)
+    ]
+    everywhere = [*names, *(c.name for c in controls)]
+    transitions = []
+    for i in range(draw(st.integers(3, 8))):
+        sources = draw(st.lists(st.sampled_from(everywhere), min_size=1, max_size=2, unique=True))
+        ends = st.sampled_from([(End.NORMAL, None), (End.ERROR, None), (End.GOING, None), (End.PREEMPT, Counts.NONE)])
+        inputs = tuple(Input(s, 1, *draw(ends)) if s in names else Input(s) for s in sources)
+        outputs = tuple(Output(p) for p in draw(st.lists(st.sampled_from(everywhere), max_size=2, unique=True)))
+        barred = draw(st.lists(st.sampled_from(everywhere), max_size=1))
+        trigger = draw(st.sampled_from(["event", "after", "none"]))
+        going_only = all(a.end is End.GOING for a in inputs)
+        transitions.append(
+            Transition(
+                f"t{i}",
+                inputs,
+                outputs,
+                tuple(Inhibitor(p, 1) for p in barred if p not in sources),
+                events=("e",) if trigger == "event" or going_only else (),
+                after=1.0 if trigger == "after" and not going_only else None,
+            )
+        )
+    return task_of([action(n) for n in names], controls, transitions, "c0 == 9",
+                   events={"e": Event("e", Scope.EXTERNAL, mean_wait=1.0)})  # fmt: skip
+
+
+@settings(max_examples=60, deadline=None)
+@given(tasks())
+def test_every_firing_of_the_stochastic_view_projects_on_the_ordinary_net(task: Task) -> None:
+    view = stochastic_view(task, stages=2, timer_stages=2)
+    space = explore(view.gspn.net, limits=Limits(states=1500))
+    net, gspn_net = task.net, view.gspn.net
+    for i, t, j in zip(space.source.tolist(), space.label.tolist(), space.target.tolist(), strict=True):
+        before, after = view.projected(space.marking(i)), view.projected(space.marking(j))
+        name = view.origin.get(gspn_net.transitions[t])
+        if name is None:
+            assert before == after
+        else:
+            assert net.fire(before, net.transition_index[name]) == after
+
+
+@settings(max_examples=60, deadline=None)
+@given(tasks())
+def test_tokens_of_action_places_are_runs_that_go_on_or_have_ended(task: Task) -> None:
+    view = stochastic_view(task, stages=2, timer_stages=2)
+    space = explore(view.gspn.net, limits=Limits(states=800))
+    index = view.gspn.net.place_index
+    for place in task.places.values():
+        if place.kind is Kind.ACTION:
+            own = space.tokens(index[place.name])
+            parts = sum(space.tokens(index[f"{place.name}.{s}"]) for s in ("going", *Status))
+            assert (own == parts).all()
+
+
+def test_the_operators_hand_is_there_on_request() -> None:
+    task = one_step()
+    task = replace(task, places={**task.places, "idle": replace(task.places["idle"], capacity=2)})
+    view = OrdinaryView(task, operator=True)
+    assert view.net.transitions[-2:] == ("put.idle", "take.idle")
+    assert view.controllable == {"put.idle", "take.idle", "go"}
+    space = explore(view.net, limits=Limits(states=100))
+    assert space.bounds[view.net.place_index["idle"]] == 2
+    assert space.number((0,) * len(view.net.places)) is not None
+
+
+# The shipped tasks.
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda p: p.stem)
+def test_shipped_tasks_are_bounded_live_proper_and_recoverable(path: Path) -> None:
+    view = OrdinaryView(load(path))
+    space = explore(view.net)
+    open_net = examine(space, final=view.is_end)
+    assert open_net.bounded.holds and open_net.deadlock_free.holds
+    assert open_net.sound is not None and open_net.sound.holds
+    closed = explore(view.closed(space))
+    closed_net = examine(closed)
+    assert closed_net.live.holds and closed_net.reversible.holds and closed_net.deadlock_free.holds
+    robot = judge(closed, view.roles(closed.net), space)
+    assert robot.stable.holds and robot.controllable.holds
+    assert {r.error_exit for r in robot.recoveries} == view.error_exits
+    assert all(r.almost_sure.holds and r.possible.holds for r in robot.recoveries)
+
+
+def catching() -> Task:
+    return load(next(p for p in SHIPPED if p.stem == "catch_ball"))
+
+
+def test_the_catching_task_survives_three_further_errors() -> None:
+    view = OrdinaryView(catching())
+    space = explore(view.net)
+    closed = explore(view.closed(space))
+    kappa = {r.error_exit: r.kappa for r in judge(closed, view.roles(closed.net), space).recoveries}
+    assert kappa["move_failed"] == kappa["catch_failed"] == kappa["home_failed"] == 3
+    assert kappa["not_located"] is None and kappa["give_up"] == -1
+
+
+def test_broken_variants_are_caught_with_witnesses() -> None:
+    task = catching()
+    lost = {n: t for n, t in task.transitions.items() if n not in ("recovered", "recover_again", "give_up")}
+    view = OrdinaryView(replace(task, transitions=lost))
+    stuck = examine(explore(view.net), final=view.is_end)
+    assert stuck.deadlock_free.holds is False and stuck.deadlock_free.witness is not None
+    assert list(view.net.replay(stuck.deadlock_free.witness.firings))[-1][view.net.place_index["recover_arm"]] == 1
+
+    twice = (Output("arm_free"), Output("camera_free"), Output("runs", 2))
+    leaking = replace(task.transitions["not_located"], outputs=twice)
+    view = OrdinaryView(replace(task, transitions={**task.transitions, "not_located": leaking}))
+    leak = examine(explore(view.net, limits=Limits(states=3000)), final=view.is_end)
+    assert leak.bounded.holds is False and leak.bounded.witness is not None and "runs" in leak.bounded.reason
+    *_, before = view.net.replay(leak.bounded.witness.firings)
+    *_, after = view.net.replay(leak.bounded.witness.loop, before)
+    assert after[view.net.place_index["runs"]] > before[view.net.place_index["runs"]]
+
+    double = replace(task.transitions["in_place"], outputs=(Output("catch_ball"), Output("arm_free")))
+    places = {**task.places, "arm_free": replace(task.places["arm_free"], capacity=None)}
+    view = OrdinaryView(replace(task, places=places, transitions={**task.transitions, "in_place": double}))
+    space = explore(view.net, limits=Limits(states=20_000))
+    both = (space.tokens(view.net.place_index["arm_free"]) > 0) & (space.tokens(view.net.place_index["catch_ball"]) > 0)
+    assert both.any()
+    assert list(view.net.replay(space.path(int(np.argmax(both)))))[-1] == space.marking(int(np.argmax(both)))
