@@ -38,9 +38,13 @@ class CoordinatorParty:
         return self.mission.stage is Stage.OVER
 
     def receive(self, now: float, envelope: Envelope) -> None:
-        """Take a node's message."""
+        """Take a node's message, and what comes of it at once: so the order of arrival counts, not that of the nodes."""
+        self._now = now
         node = self._directory.party(envelope.source)
-        self.mission.callers[node].receive(now, envelope.body)
+        caller = self.mission.callers[node]
+        caller.receive(now, envelope.body)
+        if notices := caller.notices():
+            self.mission.take(now, node, notices)
 
     def advance(self, now: float) -> None:
         """Begin once every node has welcomed us; then do what is due."""

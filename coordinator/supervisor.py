@@ -65,13 +65,11 @@ class Supervisor:
         logs: Path,
         *,
         respawn: bool = True,
-        wait_ready: bool = True,
         notice: Callable[[str], None] | None = None,
     ) -> None:
         logs.mkdir(parents=True, exist_ok=True)
         self._children = [_Child(program, logs / f"{program.name}.log") for program in programs]
         self._respawn = respawn
-        self._wait_ready = wait_ready
         self._notice = notice or (lambda _: None)
         self._stopping = False
 
@@ -89,12 +87,12 @@ class Supervisor:
         await self.stop()
 
     async def start(self, timeout: float = 30.0) -> None:
-        """Start all programs and wait until each is ready (unless told not to: lock-step nodes wait for the coordinator)."""
+        """Start all programs and wait until each is ready."""
         for first in (True, False):
             group = [child for child in self._children if child.program.first is first]
             for child in group:
                 child.task = asyncio.create_task(self._keep(child), name=f"keep {child.program.name}")
-            for child in group if self._wait_ready else ():
+            for child in group:
                 await self._until_ready(child, timeout)
 
     async def stop(self) -> None:

@@ -36,7 +36,7 @@ class Slope:
     elasticity: float
 
 
-def _slopes(chain: Chain, by_edge: Values, whole: float) -> dict[str, Slope]:
+def slopes_of(chain: Chain, by_edge: Values, whole: float) -> dict[str, Slope]:
     """Derivatives from the contribution of each edge to d / d(log theta)."""
     gspn = chain.gspn
     logs = sum_by(chain.label, by_edge, len(gspn.net.transitions))
@@ -52,7 +52,7 @@ def reliability_slopes(done: Completion) -> dict[str, Slope]:
     """Derivatives of the probability of completing, by transition."""
     chain, h = done.chain, done.h
     by_edge = _flow(done) * (h[chain.target] - h[chain.source])
-    return _slopes(chain, by_edge, done.probability)
+    return slopes_of(chain, by_edge, done.probability)
 
 
 def time_slopes(done: Completion) -> dict[str, Slope]:
@@ -68,7 +68,7 @@ def time_slopes(done: Completion) -> dict[str, Slope]:
     dy = y[chain.target] - y[chain.source]
     changed_y = flow * dy + second_flow * dh
     by_edge = changed_y / done.probability - done.mean / done.probability * flow * dh
-    return _slopes(chain, by_edge, done.mean)
+    return slopes_of(chain, by_edge, done.mean)
 
 
 def _transient(done: Completion) -> np.ndarray:
@@ -110,7 +110,7 @@ def reward_slopes(
     reward = run.reward(state, impulse)
     bias = _bias(chain, members, reward, state, gain)
     by_edge = run.flow * (gain[chain.label] + bias[chain.target] - bias[chain.source])
-    return _slopes(chain, by_edge, reward)
+    return slopes_of(chain, by_edge, reward)
 
 
 def _bias(chain: Chain, members: Index, reward: float, state: Values | None, gain: Values) -> Values:

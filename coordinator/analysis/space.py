@@ -138,13 +138,13 @@ class Space:
         """A shortest firing sequence from the initial marking to marking number `goal`."""
         sequence = []
         while goal:
-            edge = int(self._parent_edge[goal])
+            edge = int(self.parent_edge[goal])
             sequence.append(self.net.transitions[self.label[edge]])
             goal = int(self.source[edge])
         return sequence[::-1]
 
     @cached_property
-    def _parent_edge(self) -> NDArray[np.int64]:
+    def parent_edge(self) -> NDArray[np.int64]:
         """The first edge that leads to each marking: breadth-first numbering makes it one of a shortest path."""
         parent = np.full(len(self), -1, dtype=np.int64)
         parent[self.target[::-1]] = np.arange(len(self.target) - 1, -1, -1)

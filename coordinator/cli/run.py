@@ -206,7 +206,7 @@ async def _spread_lockstep(
     member, party = lockstep_member(directory, setting, watch)
     party.mission.executor.observers.append(timeline)
     programs = local_programs(directory, lockstep=True, mock=options.mock)
-    supervisor = Supervisor(programs, Path("runs/logs"), respawn=False, wait_ready=False)
+    supervisor = Supervisor(programs, Path("runs/logs"), respawn=False)
     async with supervisor:
         await asyncio.to_thread(_go, member, lambda: party.over)
     return party

@@ -130,7 +130,8 @@ class Member:
     """One process of a lock-step cell. `addresses` (host, port) name all members, this one too; `name` is among them.
 
     `hosts` says which member each party of the cell lives in; without it each member is one party of its own name.
-    `directory` (hash of services.toml) must be the same in all. `patience` is in seconds of wall time.
+    `directory` (hash of services.toml) must be the same in all. `patience` is how long a mark may be
+    missing, `joining` how long members may take to come together (s of wall time; importing takes some on a busy host).
     """
 
     def __init__(
@@ -144,6 +145,7 @@ class Member:
         directory: str = "",
         key: bytes | None = None,
         patience: float = 10.0,
+        joining: float = 60.0,
         listener: socket.socket | None = None,
     ) -> None:
         self.name = name
@@ -155,6 +157,7 @@ class Member:
         self._directory = directory
         self._key = key
         self._patience = patience
+        self._joining = joining
         self._listener = listener
         self._links: dict[str, TickLink] = {}
         self._boot = secrets.token_hex(8)
@@ -164,11 +167,11 @@ class Member:
     def open(self) -> None:
         """Listen, reach the members sorted before this one, wait for those sorted after it.
 
-        Raises PartyLostError for one that does not come within `patience`, CellError for one that does not fit.
+        Raises PartyLostError for one that does not come within `joining`, CellError for one that does not fit.
         """
         before = sorted(peer for peer in self._addresses if peer < self.name)
         after = {peer for peer in self._addresses if peer > self.name}
-        deadline = time.monotonic() + self._patience
+        deadline = time.monotonic() + self._joining
         listener = self._listener or self._listen()
         try:
             for peer in before:
@@ -227,7 +230,7 @@ class Member:
         try:
             sock, _ = listener.accept()
         except TimeoutError:
-            raise PartyLostError(min(after), f"it did not join the cell in {self._patience:g} s") from None
+            raise PartyLostError(min(after), f"it did not join the cell in {self._joining:g} s") from None
         _tune(sock)
         connection = self._connection(Side.SERVER)
         try:

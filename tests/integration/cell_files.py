@@ -1,0 +1,37 @@
+"""Location files of the catching cell for tests: on free ports, or with things moved to other nodes."""
+
+from __future__ import annotations
+
+import re
+import socket
+from collections.abc import Mapping
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+SHIPPED = (ROOT / "services.toml").read_text(encoding="utf-8")
+
+
+def free_ports(count: int) -> list[int]:
+    """Ports of this host that nobody listens on now."""
+    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
+    ports = [s.getsockname()[1] for s in sockets]
+    for one in sockets:
+        one.close()
+    return ports
+
+
+def services_file(folder: Path, *, edits: Mapping[str, str] | None = None, more: str = "") -> Path:
+    """The shipped services.toml on free ports, with exact lines replaced and more added at its end."""
+    text = SHIPPED.replace('"services/cell.toml"', f'"{ROOT / "services/cell.toml"}"')
+    for old, new in (edits or {}).items():
+        assert old in text, f"services.toml has no line {old!r} any more"
+        text = text.replace(old, new)
+    text += more
+    named = sorted({int(port) for port in re.findall(r"\b(73\d\d)\b", text)} | {7299})
+    table = dict(zip(named, free_ports(len(named)), strict=True))
+    text = re.sub(r"\b(73\d\d|7299)\b", lambda found: str(table[int(found.group())]), text)
+    if "[coordinator]" not in re.sub(r"#.*", "", text):
+        text += f'\n[coordinator]\nhost = "127.0.0.1"\nport = {table[7299]}\n'
+    path = folder / "services.toml"
+    path.write_text(text, encoding="utf-8")
+    return path

@@ -1,0 +1,79 @@
+"""The whole cell in lock step: the same result in one and in several processes, and wherever things are placed."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.integration.cell_files import ROOT, services_file
+
+DESK = """
+[nodes.desk]
+host = "127.0.0.1"
+port = 7305
+"""
+
+
+def run(services: Path, *arguments: str, seed: int = 5, regime: str = "B") -> dict[str, Any]:
+    """Two throws; the result without its wall-clock time."""
+    path = services.parent / "out.json"
+    given = ["--services", str(services), "--mode", "lockstep", "--runs", "2", "--seed", str(seed), "--regime", regime]
+    command = [
+        sys.executable,
+        "-m",
+        "coordinator",
+        "run",
+        "catch_ball",
+        *given,
+        "--json",
+        str(path),
+        "--quiet",
+        *arguments,
+    ]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    result: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    del result["wall_s"]
+    return result
+
+
+@pytest.fixture(scope="module")
+def usual(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The result of the shipped placement in one process."""
+    result = run(services_file(tmp_path_factory.mktemp("usual")))
+    assert result["status"] == "success"
+    assert result["caught"] == 2
+    return result
+
+
+@pytest.mark.processes
+def test_one_process_a_node_gives_the_same(usual: dict[str, Any], tmp_path: Path) -> None:
+    """Coordinator, laboratory, vision and motion in four processes."""
+    assert run(services_file(tmp_path), "--processes", "0") == usual
+
+
+@pytest.mark.processes
+def test_a_third_node_changes_nothing(usual: dict[str, Any], tmp_path: Path) -> None:
+    """Global memory and sampling tick on a node of their own: three nodes, laboratory and coordinator, five processes."""
+    edits = {
+        '[timers.image_tick]\nnode = "vision"': '[timers.image_tick]\nnode = "desk"',
+        'memory.compare_and_set, memory.list\nnode = "vision"': 'memory.compare_and_set, memory.list\nnode = "desk"',
+    }
+    assert run(services_file(tmp_path, edits=edits, more=DESK), "--processes", "0") == usual
+
+
+def test_moving_the_camera_and_its_actions_changes_nothing(usual: dict[str, Any], tmp_path: Path) -> None:
+    """One line of services.toml puts the camera, and so seven actions, on the arm's computer: the same catches."""
+    edits = {'[devices.camera]\nnode = "vision"': '[devices.camera]\nnode = "motion"'}
+    assert run(services_file(tmp_path, edits=edits)) == usual
+
+
+def test_another_seed_gives_other_throws(usual: dict[str, Any], tmp_path: Path) -> None:
+    """The seed is what decides."""
+    other = run(services_file(tmp_path), seed=6)
+    assert [t["speed"] for t in other["throws"]] != [t["speed"] for t in usual["throws"]]

@@ -1,0 +1,107 @@
+"""The cell on the wall clock over real processes: nodes are killed in mid-task, and the task goes on through its error branches."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from coordinator.cli.loading import load_task
+from coordinator.engine import Fired, Instruction, RunRecorded, StartRun, State, Stimulus
+from coordinator.launch import Setting, local_programs, mission_id, realtime_mission
+from coordinator.mission import Mission
+from coordinator.realtime import RealtimeMission
+from coordinator.supervisor import Supervisor
+from coordinator.task import Executed, Status
+from services.comm.directory import load
+from services.comm.notice import Progress
+from tests.integration.cell_files import services_file
+
+pytestmark = pytest.mark.processes
+LIMIT = 120.0
+
+
+class When:
+    """An observer that does something once, when an action place is entered for the first time."""
+
+    def __init__(self, place: str, do: Callable[[], None]) -> None:
+        self._place, self._do = place, do
+        self.done = False
+
+    def instruction(self, now: float, instruction: Instruction) -> None:
+        """Look for the start of the place's first run."""
+        if isinstance(instruction, StartRun) and instruction.place == self._place and not self.done:
+            self.done = True
+            self._do()
+
+    def stimulus(self, now: float, stimulus: Stimulus) -> None:
+        """Nothing to do."""
+
+    def progress(self, now: float, run: str, notice: Progress) -> None:
+        """Nothing to do."""
+
+    def settled(self, now: float, state: State) -> None:
+        """Nothing to do."""
+
+
+async def run_and_kill(folder: Path, place: str, node: str) -> tuple[Mission, list[RunRecorded], Supervisor]:
+    """Two runs over launched nodes; a node is killed (kill -9) when the place is first entered."""
+    directory, task = load(services_file(folder)), load_task("catch_ball")
+    mission = realtime_mission(directory, Setting(task, runs=2, seed=3), mission_id(task))
+    async with Supervisor(local_programs(directory), folder / "logs") as supervisor:
+        shell = RealtimeMission(mission, directory)
+        killer = When(place, lambda: os.kill(supervisor.process_ids()[node], signal.SIGKILL))
+        mission.executor.observers.append(killer)
+        try:
+            await shell.connect(20.0)
+            await asyncio.wait_for(shell.run(), LIMIT)
+        finally:
+            await shell.close()
+    assert killer.done
+    return mission, mission.tally.runs, supervisor
+
+
+@pytest.mark.parametrize(("place", "node"), [("track_ball", "vision"), ("catch_ball", "motion")])
+async def test_a_node_killed_in_mid_catch_is_an_error_and_the_task_goes_on(
+    tmp_path: Path, place: str, node: str
+) -> None:
+    """kill -9: its run ends in ERROR with executed = unknown and a reason, the node is started again, final is reached."""
+    mission, runs, supervisor = await run_and_kill(tmp_path, place, node)
+    finished = mission.executor.finished
+    assert finished is not None
+    killed = next(r for r in runs if r.place == place)
+    assert (killed.status, killed.executed) == (Status.ERROR, Executed.UNKNOWN)
+    assert killed.cause in ("lost", "rebooted")
+    assert killed.text
+    assert supervisor.starts(node) == 2
+    assert len(mission.tally.cycles) == 2 or finished.status is Status.ERROR
+    assert all(r.cause for r in runs if r.status is Status.ERROR)
+
+
+async def test_every_firing_of_a_live_run_is_one_of_the_ordinary_net(tmp_path: Path) -> None:
+    """A real run, projected on markings, is a firing sequence of the ordinary net."""
+    directory, task = load(services_file(tmp_path)), load_task("catch_ball")
+    mission = realtime_mission(directory, Setting(task, runs=1, seed=4), mission_id(task))
+    firings: list[Fired] = []
+
+    class Keep(When):
+        def instruction(self, now: float, instruction: Instruction) -> None:
+            if isinstance(instruction, Fired):
+                firings.append(instruction)
+
+    mission.executor.observers.append(Keep("", lambda: None))
+    async with Supervisor(local_programs(directory), tmp_path / "logs"):
+        shell = RealtimeMission(mission, directory)
+        try:
+            await shell.connect(20.0)
+            await asyncio.wait_for(shell.run(), LIMIT)
+        finally:
+            await shell.close()
+    net = mission.executor.task.net
+    markings = list(net.replay([f.transition for f in firings], firings[0].before))
+    assert markings[-1] == mission.executor.state.marking
+    assert mission.score["over"] + sum(c.status is Status.ERROR for c in mission.tally.cycles) >= 1
