@@ -1,6 +1,6 @@
 """Makes what docs/vision.md shows: the annotated camera image and the tables. Run it as `python -m tests.vision.figures`.
 
-With `--tables` it prints the tables (a minute or two), with `--picture` it writes docs/vision-catch.png.
+With `--tables` it prints the tables (a minute or two), with `--picture` it writes docs/pictures/camera.png.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from services.vision.prediction import ConstantVelocity, Kalman, LeastSquares, P
 from sim.camera import PinholeCamera
 from tests.vision.bench import ROOT, Array, Bench, BenchContext, BenchPorts, draw_ball, read_cell, run_action, true_view
 
-PICTURE = ROOT / "docs" / "vision-catch.png"
+PICTURE = ROOT / "docs" / "pictures" / "camera.png"
 ENLARGED = 1.5
 LOCATORS = ("background", "mog2", "hough", "threshold")
 PREDICTORS: dict[str, Callable[[Surface], Predictor]] = {
