@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import configparser
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -181,6 +182,9 @@ class CanopenNode:
         self.nmt = NmtState.BOOT_UP
         self.outbox: list[Frame] = []
         self._latched: bytes | None = None
+        self._applied: bytes | None = None
+        self._shown: list[int] = []
+        self._frame: Frame | None = None
         self._beat_due = 0.0
         self._master_due: float | None = None
 
@@ -218,6 +222,7 @@ class CanopenNode:
         self.tpdo.refresh()
         self.after_configuring()
         self._latched, self._master_due, self._beat_due = None, None, now
+        self._frame = self._applied = None
         self.outbox.append(heartbeat(self.node, NmtState.BOOT_UP))
         self.nmt = NmtState.PREOPERATIONAL
         self.on_nmt(now, NmtState.BOOT_UP)
@@ -226,9 +231,9 @@ class CanopenNode:
         """Take a frame off the bus."""
         cob_id = frame.id
         if cob_id == self.rpdo.cob_id and self.rpdo.on:
-            self._take_rpdo(now, frame.data)
+            self.take_rpdo(now, frame.data)
         elif cob_id == SYNC_ID:
-            self._sync(now)
+            self.sync(now)
         elif cob_id == SDO_REQUEST_BASE + self.node:
             self._serve(now, frame)
         elif cob_id == NMT_ID and len(frame.data) == 2 and frame.data[1] in (0, self.node):
@@ -246,6 +251,11 @@ class CanopenNode:
             self._master_due = None
             self.on_master_lost(now)
 
+    def due(self) -> float:
+        """When `advance` has something to do next, as far as is known now (s)."""
+        beat = self._beat_due if self.values[0x1017, 0] else math.inf
+        return beat if self._master_due is None else min(beat, self._master_due)
+
     def drain(self) -> Sequence[Frame]:
         """Frames to send, oldest first."""
         frames, self.outbox = self.outbox, []
@@ -262,9 +272,14 @@ class CanopenNode:
         if self.nmt is NmtState.OPERATIONAL and self.tpdo.on:
             self.before_sending()
             values = self.values
-            self.outbox.append(Frame(self.tpdo.cob_id, self.tpdo.layout.pack(*[values[key] for key in self.tpdo.keys])))
+            content = [values[key] for key in self.tpdo.keys]
+            if self._frame is None or content != self._shown:
+                self._shown = content
+                self._frame = Frame(self.tpdo.cob_id, self.tpdo.layout.pack(*content))
+            self.outbox.append(self._frame)
 
-    def _take_rpdo(self, now: float, data: bytes) -> None:
+    def take_rpdo(self, now: float, data: bytes) -> None:
+        """Keep the data of an RPDO until SYNC, or obey at once if it is not synchronous."""
         if self.nmt is not NmtState.OPERATIONAL:
             return
         if len(data) < self.rpdo.layout.size:
@@ -275,16 +290,21 @@ class CanopenNode:
             self._apply_rpdo(now)
 
     def _apply_rpdo(self, now: float) -> None:
-        if self._latched is not None:
-            self.values.update(zip(self.rpdo.keys, self.rpdo.layout.unpack_from(self._latched), strict=True))
-            self._latched = None
-            self.after_receiving(now)
+        data = self._latched
+        if data is None:
+            return
+        self._latched = None
+        if data != self._applied:
+            self._applied = data
+            self.values.update(zip(self.rpdo.keys, self.rpdo.layout.unpack_from(data), strict=True))
+        self.after_receiving(now)
 
-    def _sync(self, now: float) -> None:
+    def sync(self, now: float) -> None:
+        """SYNC has come."""
         if self.nmt is NmtState.OPERATIONAL:
             self._apply_rpdo(now)
             self.on_sync(now)
-            if self.tpdo.exists and self.tpdo.synchronous:
+            if self.tpdo.synchronous:
                 self.send_tpdo()
 
     def _order(self, now: float, command: int) -> None:
@@ -334,8 +354,10 @@ class CanopenNode:
             raise SdoAbortError(Abort.VALUE, index, sub)
         self.check_write(index, sub, value)
         self.values[index, sub] = value
+        self._applied = None
         if pdo is not None and (sub == 0 or index == pdo.parameters):
             pdo.refresh()
+            self._frame = None
         if (index, sub) == (0x1016, 1):
             self._master_due = None  # watched from the next heartbeat on
         self.after_configuring()

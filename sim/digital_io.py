@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 from sim.canopen_node import CanopenNode
@@ -28,6 +29,14 @@ class DigitalInputs(CanopenNode):
     def before_sending(self) -> None:
         """Show the inputs."""
         self.values[0x6000, 1] = self.inputs
+
+    def due(self) -> float:
+        """At once while a change is still to be sent."""
+        if self.tpdo.synchronous:
+            return super().due()
+        if self.inputs != self._sent:
+            return -math.inf
+        return min(super().due(), self._due) if self.values[0x1800, 5] else super().due()
 
     def advance(self, now: float) -> None:
         """Send on change, and again when the event timer says so."""

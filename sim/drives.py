@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, Protocol
 
 from services.comm.canbus import Frame
-from services.comm.canopen import Abort, NmtState, SdoAbortError
+from services.comm.canopen import SYNC_ID, Abort, NmtState, SdoAbortError
 from services.comm.cia402 import (
     UNITS,
     Command,
@@ -48,6 +48,10 @@ _POSITION, _VELOCITY, _TORQUE, _TARGET = (
 )
 _POWERED: Final = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
 _DOWN: Final = (State.FAULT, State.FAULT_REACTION_ACTIVE)
+_ENABLED: Final = State.OPERATION_ENABLED
+_REMOTE, _VOLTAGE = int(StatusBit.REMOTE), int(StatusBit.VOLTAGE_ENABLED)
+_FOLLOWS, _LIMIT, _ERROR = int(StatusBit.FOLLOWS_COMMAND), int(StatusBit.INTERNAL_LIMIT), int(StatusBit.FOLLOWING_ERROR)
+_ENABLE_MASK, _ENABLE = Command.ENABLE_OPERATION.value
 
 
 class Plant(Protocol):
@@ -85,10 +89,13 @@ def ratings(table: Mapping[str, Any]) -> tuple[DriveRating, ...]:
 class Drive(CanopenNode):
     """One drive: CiA 402 state machine in cyclic synchronous position mode around a `JointServo`."""
 
-    def __init__(self, joint: int, rating: DriveRating, plant: Plant) -> None:
+    def __init__(self, joint: int, rating: DriveRating, plant: Plant, stir: Callable[[], None]) -> None:
+        """`stir` is called whenever something happens that may change the torque of a joint at rest."""
         super().__init__(joint + 1, "joint_drive.eds")
         self.joint = joint
         self.plant = plant
+        self._stir = stir
+        self._measured: tuple[float, float, float] | None = None
         self.servo = JointServo(rating, plant.q[joint])
         self.state = State.NOT_READY_TO_SWITCH_ON
         self.powered = True
@@ -109,15 +116,19 @@ class Drive(CanopenNode):
         elif before is NmtState.OPERATIONAL and self.state is State.OPERATION_ENABLED:
             self._quick_stop(State.QUICK_STOP_ACTIVE)
         self._synced = now
+        self._measured = None
         self._refresh()
 
     def before_sending(self) -> None:
         """Bring status, position, speed and torque up to date."""
-        values = self.values
+        values, plant, joint = self.values, self.plant, self.joint
         values[_STATUSWORD] = self.statusword()
-        values[_POSITION] = round(self.plant.q[self.joint] * UNITS)
-        values[_VELOCITY] = round(self.plant.qd[self.joint] * UNITS)
-        values[_TORQUE] = round(1000.0 * self._torque / self.servo.rating.torque)
+        measured = plant.q[joint], plant.qd[joint], self._torque
+        if measured != self._measured:
+            self._measured = measured
+            values[_POSITION] = round(measured[0] * UNITS)
+            values[_VELOCITY] = round(measured[1] * UNITS)
+            values[_TORQUE] = round(1000.0 * self._torque / self.servo.rating.torque)
 
     def before_reading(self) -> None:
         """Bring what only an SDO reads up to date as well."""
@@ -130,6 +141,8 @@ class Drive(CanopenNode):
         """Obey the controlword; take over what configuration changes."""
         word = self.values[_CONTROLWORD]
         before, self._controlword = self._controlword, word
+        if word & _ENABLE_MASK == _ENABLE and self.state is _ENABLED:
+            return  # nothing new
         command = command_of(word)
         if command is Command.FAULT_RESET and before & 0x80:
             return
@@ -139,8 +152,10 @@ class Drive(CanopenNode):
     def on_sync(self, now: float) -> None:
         """A new set point is due."""
         self._synced = now
-        if self.state is State.OPERATION_ENABLED:
+        if self.state is _ENABLED:
             self.servo.aim(self._target())
+            if not self.servo.standing:
+                self._stir()
 
     def on_master_lost(self, now: float) -> None:
         """Stop by itself."""
@@ -155,6 +170,7 @@ class Drive(CanopenNode):
         self._range = values[Object.SOFTWARE_LIMITS, 1], values[Object.SOFTWARE_LIMITS, 2]
         if values[Object.INTERPOLATION_PERIOD, 1]:
             self.servo.period = values[Object.INTERPOLATION_PERIOD, 1] * 10.0 ** values[Object.INTERPOLATION_PERIOD, 2]
+        self._stir()
 
     def check_write(self, index: int, sub: int, value: int) -> None:
         """No other mode than cyclic synchronous position, and no change of configuration while the motor has torque."""
@@ -183,33 +199,45 @@ class Drive(CanopenNode):
 
     def statusword(self) -> int:
         """Object 6041h."""
-        word: int = self.state.word | StatusBit.REMOTE
+        word: int = self.state.word | _REMOTE
         if self.powered:
-            word |= StatusBit.VOLTAGE_ENABLED
-        if self.state is State.OPERATION_ENABLED:
-            word |= StatusBit.FOLLOWS_COMMAND
-            word |= StatusBit.INTERNAL_LIMIT if self.servo.limited else 0
-            word |= StatusBit.FOLLOWING_ERROR if self._error_since is not None else 0
+            word |= _VOLTAGE
+        if self.state is _ENABLED:
+            word |= _FOLLOWS
+            word |= _LIMIT if self.servo.limited else 0
+            word |= _ERROR if self._error_since is not None else 0
         return word
 
-    def torque(self, now: float, dt: float) -> float:
-        """Torque of the next `dt` seconds (N m); 0 without power."""
-        if self.state not in _POWERED:
+    def torque(self, now: float, dt: float, q: float, qd: float) -> float:
+        """Torque of the next `dt` seconds (N m) from the joint's angle and speed; 0 without power."""
+        state = self.state
+        if state is not _ENABLED and state not in _POWERED:
             return 0.0
         servo = self.servo
-        self._torque = tau = servo.torque(self.plant.q[self.joint], self.plant.qd[self.joint], dt)
-        if self.state is State.FAULT_REACTION_ACTIVE:
-            if servo.ramped_down and abs(self.plant.qd[self.joint]) < 0.02:
-                self._enter(State.FAULT)
-        elif self.state is State.OPERATION_ENABLED:
+        self._torque = tau = servo.torque(q, qd, dt)
+        if state is _ENABLED:
             self._watch(now)
+        elif state is State.FAULT_REACTION_ACTIVE and servo.ramped_down and abs(qd) < 0.02:
+            self._enter(State.FAULT)
         return tau
+
+    @property
+    def settled(self) -> bool:
+        """Whether the torque of a joint at rest stays as it is unless something happens."""
+        if self.state not in _POWERED:
+            return True
+        return self.servo.settled and self._error_since is None and self.state is not State.FAULT_REACTION_ACTIVE
+
+    @property
+    def waits_until(self) -> float:
+        """When the drive misses SYNC (s)."""
+        return self._synced + self._sync_patience if self.state is _ENABLED else math.inf
 
     def _watch(self, now: float) -> None:
         """Following error (6065h, 6066h) and loss of SYNC (1006h)."""
         if now - self._synced > self._sync_patience + 1e-9:
             self.trip(Fault.SYNC_LOST)
-        elif abs(self.servo.error) <= self._window:
+        elif -self._window <= self.servo.error <= self._window:
             self._error_since = None
         elif self._error_since is None:
             self._error_since = now
@@ -218,8 +246,8 @@ class Drive(CanopenNode):
 
     def _target(self) -> float:
         """Object 607Ah within the software limits 607Dh, in rad."""
-        low, high = self._range
-        return min(max(self.values[_TARGET], low), high) / UNITS
+        (low, high), target = self._range, self.values[_TARGET]
+        return (low if target < low else high if target > high else target) / UNITS
 
     def _obey(self, now: float, command: Command) -> None:
         state = after(self.state, command)
@@ -248,32 +276,40 @@ class Drive(CanopenNode):
         self._error_since = None
         self.plant.release(self.joint)
         self.state = State.OPERATION_ENABLED
+        self._stir()
 
     def _quick_stop(self, state: State) -> None:
         self.servo.ramp_down(from_units(self.values[Object.QUICK_STOP_DECELERATION, 0]))
         self.state = state
+        self._stir()
 
     def _enter(self, state: State) -> None:
         """A state without torque: the brake holds."""
         self._torque = 0.0
         self.plant.brake(self.joint)
         self.state = state
+        self._stir()
 
     def _refresh(self) -> None:
         self.servo.limit = self.servo.rating.speed * self._speed_factor
         self.values[Object.MAX_SPEED, 0] = to_units(self.servo.limit)
+        self._stir()
 
 
 class DriveBus:
     """Everything on the arm's bus but the master: six drives (nodes 1 to 6) and the digital inputs (node 7).
 
     In each step of the plant (1 kHz or faster): `receive` what came, then `step(now, dt)`, which also moves the plant,
-    then send what `drain` gives. Times are seconds on the caller's clock.
+    then send what `drain` gives. Times are seconds on the caller's clock. An arm that stands still under torques that
+    do not change is at rest: until something stirs it, a step would change nothing and is left out.
     """
 
     def __init__(self, plant: Plant, drives: Sequence[DriveRating], now: float = 0.0) -> None:
         self.plant = plant
-        self.drives = tuple(Drive(joint, rating, plant) for joint, rating in enumerate(drives))
+        self._resting, self._stirred = False, True
+        self._rests_until = self._due = -math.inf
+        self._tau: list[float] = []
+        self.drives = tuple(Drive(joint, rating, plant, self._stir) for joint, rating in enumerate(drives))
         self.inputs = DigitalInputs(INPUTS_NODE)
         self._nodes: tuple[CanopenNode, ...] = (*self.drives, self.inputs)
         self._own = {node.node: node for node in self._nodes}
@@ -283,18 +319,38 @@ class DriveBus:
 
     def receive(self, now: float, frame: Frame) -> None:
         """A frame of the master's."""
-        target = self._own.get(frame.id & 0x7F) if 0x180 <= frame.id < 0x700 else None
-        if target is not None and target.rpdo.cob_id in (frame.id, -1):
-            target.receive(now, frame)
-            return
-        for node in self._nodes:
-            node.receive(now, frame)
+        cob_id = frame.id
+        target = self._own.get(cob_id & 0x7F)
+        if target is not None and target.rpdo.cob_id == cob_id and target.rpdo.on:
+            target.take_rpdo(now, frame.data)
+        elif cob_id == SYNC_ID:
+            for node in self._nodes:
+                node.sync(now)
+            self._rests_until = min([drive.waits_until for drive in self.drives])
+        else:
+            self._due = -math.inf  # it may set any timer
+            for node in self._nodes:
+                node.receive(now, frame)
 
     def step(self, now: float, dt: float) -> None:
         """Torques for `dt` seconds, the plant's motion, and what the devices do on time."""
-        for node in self._nodes:
-            node.advance(now)
-        self.plant.step(dt, [drive.torque(now, dt) for drive in self.drives])
+        if now >= self._due:
+            for node in self._nodes:
+                node.advance(now)
+            self._due = min([node.due() for node in self._nodes])
+        if self._resting and now <= self._rests_until:
+            return
+        plant, before, self._stirred = self.plant, self._tau, False
+        moving = any(plant.qd)
+        self._tau = tau = [
+            drive.torque(now, dt, q, qd) for drive, q, qd in zip(self.drives, plant.q, plant.qd, strict=True)
+        ]
+        plant.step(dt, tau)
+        if not (moving or self._stirred or tau != before or any(plant.qd)):
+            self._resting = all(drive.settled for drive in self.drives)
+
+    def _stir(self) -> None:
+        self._resting, self._stirred = False, True
 
     def drain(self) -> list[Frame]:
         """Frames to the master, oldest first."""
@@ -306,15 +362,20 @@ class DriveBus:
 
     def ball(self, present: bool) -> None:
         """The light barrier in the cup is interrupted, or free."""
-        self.inputs.put(DigitalInputs.BALL, present)
+        self._put(DigitalInputs.BALL, present)
 
     def power(self, closed: bool) -> None:
         """Close or open the arm-power chain (emergency stop). Open: the drives lose power and the brakes fall in."""
-        self.inputs.put(DigitalInputs.POWER, closed)
+        self._put(DigitalInputs.POWER, closed)
         for drive in self.drives:
             drive.powered = closed
             if not closed:
                 drive.trip(Fault.UNDERVOLTAGE)
+
+    def _put(self, mask: int, on: bool) -> None:
+        if bool(self.inputs.inputs & mask) is not on:
+            self.inputs.put(mask, on)
+            self._due = -math.inf
 
     def trip(self, joint: int, fault: Fault = Fault.OVERCURRENT) -> str:
         """Make a drive (0 to 5) fail; gives the fault in words."""

@@ -7,7 +7,6 @@ still, held by friction or brakes, costs next to nothing.
 
 from __future__ import annotations
 
-import math
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,11 +18,13 @@ from sim.puma_model import JOINTS, ArmModel, Link
 from sim.puma_urdf import urdf
 from sim.truth import Vector
 
-_REFRESH = (math.inf, 0.01, 0.01, 0.1, 0.1, math.inf)
-"""rad; the mass matrix is computed anew when a joint has moved so far: it changes by less than 1 % meanwhile. It does not
+_REFRESH = ((1, 0.01), (2, 0.01), (3, 0.1), (4, 0.1))
+"""Joint and rad; the mass matrix is computed anew when a joint has moved so far: it changes by less than 1 % meanwhile. It does not
 depend on joint 1, and on the wrist only by its light links."""
 _STILL = 1e-4
 """rad/s; slower than this and held by friction, a joint stops."""
+_STICTION = 1.05
+"""Dry friction of a joint at rest as a multiple of that of a moving one: where sliding dies down, the joint sticks."""
 _BRAKE = 2.0
 """Torque of a joint's brake as a multiple of the motor's."""
 _FADE = 0.15
@@ -48,12 +49,12 @@ class RigidBody:
         """(6, 6) kg m^2."""
         return np.array(pybullet.calculateMassMatrix(self._body, list(q), physicsClientId=self._client))
 
-    def bias(self, q: Sequence[float], qd: Sequence[float]) -> list[float]:
+    def bias(self, q: Sequence[float], qd: Sequence[float]) -> Sequence[float]:
         """Six torques (N m) that hold the arm against gravity, Coriolis and centrifugal forces."""
-        torques = pybullet.calculateInverseDynamics(
-            self._body, list(q), list(qd), self._zero, physicsClientId=self._client
+        torques: Sequence[float] = pybullet.calculateInverseDynamics(
+            self._body, q, qd, self._zero, physicsClientId=self._client
         )
-        return list(torques)
+        return torques
 
     def link_frame(self, q: Sequence[float], link: int) -> tuple[Vector, Vector]:
         """Origin (3,) and rotation (3, 3) of a URDF link (0 to 5) as PyBullet places it; for checks."""
@@ -101,7 +102,9 @@ class ArmPlant:
         self._dry: list[float] = model.coulomb.tolist()
         self._stops: list[tuple[float, float]] = list(zip(model.lower.tolist(), model.upper.tolist(), strict=True))
         self._braked = [True] * JOINTS
-        self._hold = [dry + _BRAKE * limit for dry, limit in zip(self._dry, self._limit, strict=True)]
+        self._hold, self._stick = [0.0] * JOINTS, [0.0] * JOINTS
+        for joint in range(JOINTS):
+            self.brake(joint)
         self._friction = [0.0] * JOINTS
         self._bias = self._body.bias(self.q, self.qd)
         self.slow_down(speed_factor)
@@ -117,11 +120,13 @@ class ArmPlant:
         self.tau[joint] = 0.0
         self._braked[joint] = True
         self._hold[joint] = self._dry[joint] + _BRAKE * self._limit[joint]
+        self._stick[joint] = self._hold[joint]
 
     def release(self, joint: int) -> None:
         """Release the brake of a joint (0 to 5)."""
         self._braked[joint] = False
         self._hold[joint] = self._dry[joint]
+        self._stick[joint] = _STICTION * self._dry[joint]
 
     def slow_down(self, factor: float) -> None:
         """From now on the joints reach this share (0 to 1] of their greatest speeds."""
@@ -134,34 +139,36 @@ class ArmPlant:
         if tau is not None:
             self.tau[:] = tau
         drive = self._motor_torque()
-        if self.still and _held(drive, self._bias, self._hold):
+        if self.still and _held(drive, self._bias, self._stick):
             return
         self._integrate(dt, drive)
 
     def _motor_torque(self) -> list[float]:
         """What the motors give: within the torque limits, fading above the greatest speed for what would speed up."""
-        torques = []
-        for tau, limit, speed, greatest in zip(self.tau, self._limit, self.qd, self._greatest, strict=True):
-            high = low = limit
-            if speed > greatest:
-                high *= max(0.0, 1.0 - (speed / greatest - 1.0) / _FADE)
-            elif speed < -greatest:
-                low *= max(0.0, 1.0 - (-speed / greatest - 1.0) / _FADE)
-            torques.append(high if tau > high else -low if tau < -low else tau)
-        return torques
+        return [
+            (limit if tau > limit else -limit if tau < -limit else tau)
+            if -greatest <= speed <= greatest
+            else _faded(tau, limit, speed / greatest)
+            for tau, limit, speed, greatest in zip(self.tau, self._limit, self.qd, self._greatest, strict=True)
+        ]
 
     def _integrate(self, dt: float, drive: list[float]) -> None:
-        q, qd, friction = self.q, self.qd, self._friction
-        for angle, at, far in zip(q, self._at, _REFRESH):  # noqa: B905 - both are six long; strict costs a tenth here
-            if not -far < angle - at < far:
+        q, qd, at = self.q, self.qd, self._at
+        for joint, far in _REFRESH:
+            if not -far < q[joint] - at[joint] < far:
                 self._refresh()
                 break
         self._bias = bias = self._body.bias(q, qd)
-        push = [u - b - c * v + f for u, b, c, v, f in zip(drive, bias, self._viscous, qd, friction, strict=True)]
-        speed = [v + dt * a for v, a in zip(qd, self._accelerate(push), strict=True)]
-        speed = self._rub(dt, speed)
+        t0, t1, t2, t3, t4, t5 = [
+            u - b - c * v + f for u, b, c, v, f in zip(drive, bias, self._viscous, qd, self._friction, strict=True)
+        ]
+        speed = [
+            v + dt * (a * t0 + b * t1 + c * t2 + d * t3 + e * t4 + f * t5)
+            for v, (a, b, c, d, e, f) in zip(qd, self._inverse, strict=True)
+        ]
+        self._rub(dt, speed)
         self.moves += 1
-        if max(speed) < _STILL and min(speed) > -_STILL and _held(drive, bias, self._hold):
+        if max(speed) < _STILL and min(speed) > -_STILL and _held(drive, bias, self._stick):
             self.still, self.qd = True, [0.0] * JOINTS
             return
         self.still = False
@@ -169,26 +176,21 @@ class ArmPlant:
         self.qd = speed
         self._stop_at_ends()
 
-    def _accelerate(self, torque: list[float]) -> list[float]:
-        """Inverse mass matrix times `torque`."""
-        t0, t1, t2, t3, t4, t5 = torque
-        return [a * t0 + b * t1 + c * t2 + d * t3 + e * t4 + f * t5 for a, b, c, d, e, f in self._inverse]
-
-    def _rub(self, dt: float, speed: list[float]) -> list[float]:
-        """Speeds after dry friction: the torque that would stop the joint within the step, at most its limit.
+    def _rub(self, dt: float, speed: list[float]) -> None:
+        """Take dry friction off speeds: the torque that would stop the joint within the step, at most its limit.
 
         Last step's friction is the first guess (already in `speed`), so the coupling of the joints settles over a few steps.
         """
-        change, old = [], self._friction
-        self._friction = []
-        for f, v, gain, hold in zip(old, speed, self._diagonal, self._hold, strict=True):
+        friction, change = self._friction, []
+        for joint, (f, v, gain, hold) in enumerate(zip(friction, speed, self._diagonal, self._hold, strict=True)):
             wanted = f - v / (dt * gain)
             wanted = hold if wanted > hold else -hold if wanted < -hold else wanted
-            self._friction.append(wanted)
-            change.append(wanted - f)
-        if not any(change):
-            return speed
-        return [v + dt * a for v, a in zip(speed, self._accelerate(change), strict=True)]
+            if wanted != f:
+                friction[joint] = wanted
+                change.append((dt * (wanted - f), self._inverse[joint]))
+        for push, row in change:  # the matrix is symmetric: a row is a column
+            for joint, gain in enumerate(row):
+                speed[joint] += push * gain
 
     def _stop_at_ends(self) -> None:
         for i, (low, high) in enumerate(self._stops):
@@ -207,6 +209,13 @@ class ArmPlant:
         self._body.close()
 
 
-def _held(drive: list[float], bias: list[float], hold: list[float]) -> bool:
+def _faded(tau: float, limit: float, overspeed: float) -> float:
+    """A motor's torque beyond its greatest speed: less, and at last none, for what would speed it up."""
+    rest = max(0.0, 1.0 - (abs(overspeed) - 1.0) / _FADE) * limit
+    high, low = (rest, limit) if overspeed > 0.0 else (limit, rest)
+    return high if tau > high else -low if tau < -low else tau
+
+
+def _held(drive: list[float], bias: Sequence[float], hold: list[float]) -> bool:
     """Whether friction and brakes can hold a standing arm against what pulls at it."""
     return all(-h <= u - b <= h for u, b, h in zip(drive, bias, hold, strict=True))

@@ -21,6 +21,9 @@ VELOCITY_GAIN = 180.0
 """1/s, of the velocity loop; with the inertia it gives a torque."""
 INTEGRAL_GAIN = 40.0
 """1/s, of the velocity loop's integrator: carries gravity and friction, as drives without a model of the arm must."""
+DEAD_BAND = 1e-4
+"""rad; while the set point stands and the error is smaller, the integrator keeps its value, as commercial drives do so that
+integrator and dry friction do not hunt for ever. One count of the PUMA 560's joint encoders is about as large."""
 
 
 class JointServo:
@@ -32,6 +35,7 @@ class JointServo:
 
     def __init__(self, rating: DriveRating, q: float) -> None:
         self.rating = rating
+        self._stiffness = rating.inertia * VELOCITY_GAIN
         self.limit = rating.speed
         self.period = 0.004
         self.limited = False
@@ -39,9 +43,8 @@ class JointServo:
 
     def start(self, q: float) -> None:
         """Begin to hold here, with an empty integrator."""
-        self._points = (q, q, q)
+        self._pass(q, q, q)
         self._since = 0.0
-        self.reference, self.velocity, self._acceleration = q, 0.0, 0.0
         self._integral = 0.0
         self._ramp: float | None = None
         self.error = 0.0
@@ -51,12 +54,15 @@ class JointServo:
         if self._ramp is not None:
             return
         last = self._points[2]
+        if self.standing and target == last:
+            self.limited = False
+            return
         most = self.limit * self.period
         step = target - last
         self.limited = abs(step) > most * (1.0 + 1e-3)
         if self.limited:
             target = last + math.copysign(most, step)
-        self._points = (self._points[1], last, target)
+        self._pass(self._points[1], last, target)
         self._since = 0.0
 
     def ramp_down(self, deceleration: float) -> None:
@@ -71,35 +77,47 @@ class JointServo:
     def follow(self, target: float) -> None:
         """Leave the ramp and take set points again from where the reference is."""
         self._ramp = None
-        self._points = (self.reference,) * 3
+        self._pass(self.reference, self.reference, self.reference)
         self.aim(target)
 
     def torque(self, q: float, qd: float, dt: float) -> float:
         """Torque (N m) for the next `dt` seconds from the measured angle and speed."""
-        if self._ramp is None:
-            self._interpolate(dt)
-        else:
+        if self._ramp is not None:
             self._decelerate(dt)
+        elif not self.standing:
+            self._interpolate(dt)
         self.error = error = self.reference - q
-        rating = self.rating
+        rating, stiffness = self.rating, self._stiffness
         wanted = self.velocity + POSITION_GAIN * error - qd
-        tau = rating.inertia * (self._acceleration + VELOCITY_GAIN * wanted) + self._integral
-        if -rating.torque < tau < rating.torque:
-            self._integral += rating.inertia * VELOCITY_GAIN * INTEGRAL_GAIN * wanted * dt
-            return tau
-        return math.copysign(rating.torque, tau)
+        tau = rating.inertia * self._acceleration + stiffness * wanted + self._integral
+        if not -rating.torque < tau < rating.torque:
+            return math.copysign(rating.torque, tau)
+        if not (self.standing and -DEAD_BAND < error < DEAD_BAND):
+            self._integral += stiffness * INTEGRAL_GAIN * wanted * dt
+        return tau
+
+    @property
+    def settled(self) -> bool:
+        """Whether a joint that stands still gets the same torque from now on."""
+        return self.standing and -DEAD_BAND < self.error < DEAD_BAND
+
+    def _pass(self, a: float, b: float, c: float) -> None:
+        """Interpolate from here on between these set points."""
+        self._points = a, b, c
+        self.standing = a == b == c
+        self.reference = self._from = 0.5 * (a + b)
+        self.velocity = self._rise = (b - a) / self.period
+        self._acceleration = (a - 2.0 * b + c) / (self.period * self.period)
 
     def _interpolate(self, dt: float) -> None:
-        a, b, c = self._points
-        period = self.period
-        self._since += dt
-        if self._since > period + 1e-9:  # a SYNC is missing: as if the last set point had come again
-            self._points = a, b, c = b, c, c
-            self._since -= period
-        s = self._since / period
-        self.reference = 0.5 * (1.0 - s) * (1.0 - s) * a + (0.5 + s * (1.0 - s)) * b + 0.5 * s * s * c
-        self.velocity = ((1.0 - s) * (b - a) + s * (c - b)) / period
-        self._acceleration = (a - 2.0 * b + c) / (period * period)
+        since = self._since + dt
+        if since > self.period + 1e-9:  # a SYNC is missing: as if the last set point had come again
+            _, b, c = self._points
+            self._pass(b, c, c)
+            since -= self.period
+        self._since = since
+        self.velocity = speed = self._rise + self._acceleration * since
+        self.reference = self._from + 0.5 * (self._rise + speed) * since
 
     def _decelerate(self, dt: float) -> None:
         assert self._ramp is not None
@@ -107,4 +125,5 @@ class JointServo:
         change = self._ramp * dt
         self.velocity = 0.0 if abs(before) <= change else before - math.copysign(change, before)
         self._acceleration = (self.velocity - before) / dt
+        self.standing = before == 0.0
         self.reference += 0.5 * (before + self.velocity) * dt
