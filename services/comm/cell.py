@@ -21,6 +21,7 @@ from services.comm.plain import SCALARS, NotPlainError, pack_array, plain, unpac
 
 _MESSAGES = frozenset(get_args(Message))
 _FLAT = frozenset((float, int, str, bytes, bool))
+_FRAMES = frozenset((Frame,))
 _ORDER = itemgetter(0, 1, 2)
 
 _Due = tuple[int, str, int, Envelope]
@@ -61,11 +62,13 @@ def as_received(channel: str, body: Any) -> Any:
         return body
     if kind in _MESSAGES:
         return decode(encode(body))
+    if kind is tuple:
+        kinds = set(map(type, body))
+        if kinds <= _FLAT or (channel == "can" and kinds == _FRAMES):
+            return body
     if isinstance(body, np.ndarray):
         return unpack_array(pack_array(body))
     if isinstance(body, (tuple, list)):
-        if kind is tuple and _FLAT.issuperset(map(type, body)):
-            return body
         return tuple(as_received(channel, item) for item in body)
     if isinstance(body, Mapping):
         if not all(type(key) is str for key in body):
