@@ -1,0 +1,253 @@
+"""What the commands analyse, simulate, convert and show --graph do, as plain functions: (exit code, text, plain data).
+
+Paths of tasks are opened by the caller (`load_task`), since this room knows tasks, not task files. Clocks and random seeds
+come from the caller, too.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coordinator.analysis.formats import read_net, written
+from coordinator.analysis.gspn import Gspn
+from coordinator.analysis.netfile import FormatError, NetFile
+from coordinator.analysis.ordinary import OrdinaryView
+from coordinator.analysis.picture import graph_svg
+from coordinator.analysis.report import analyse
+from coordinator.analysis.simulate import Estimate, Simulation, goal_by_marking, simulate
+from coordinator.analysis.space import EngineName, Limits, explore
+from coordinator.analysis.stochastic import NoEstimate, stochastic_view, what_if
+from coordinator.task import Place, Task, Transition
+
+OK, FAULT, BAD_INPUT = 0, 1, 2
+
+LoadTask = Callable[[Path], Task]
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a command gives back."""
+
+    code: int
+    text: str
+    data: dict[str, Any]
+
+
+def open_model(path: Path, load_task: LoadTask) -> Task | NetFile:
+    """A task (`.toml`) or a net file. Raises FormatError, and whatever `load_task` raises."""
+    return load_task(path) if path.suffix == ".toml" else read_net(path)
+
+
+def read_rates(text: str, file: str, model: NetFile) -> Gspn:
+    """A GSPN from a rates file (TOML): `[rates]` transition = 1/s, `[weights]`, `[servers]` (a number or "infinite"),
+    and `default_rate` for every transition that is not named. Raises FormatError.
+    """
+    try:
+        said = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise FormatError(file, "TOML", str(error)) from error
+    unknown = set(said) - {"rates", "weights", "servers", "default_rate"}
+    if unknown:
+        raise FormatError(file, min(unknown), "an unknown key", "known are rates, weights, servers, default_rate")
+    rates, weights = (_numbers(said.get(key, {}), file, key) for key in ("rates", "weights"))
+    servers = {name: None if n == "infinite" else n for name, n in said.get("servers", {}).items()}
+    if "default_rate" in said:
+        missing = [t for t in model.net.transitions if t not in rates and t not in weights]
+        rates |= dict.fromkeys(missing, float(said["default_rate"]))
+    try:
+        return Gspn.of(model.net, rates, weights=weights, servers=servers)
+    except (ValueError, TypeError) as error:
+        raise FormatError(file, "rates", str(error)) from error
+
+
+def _numbers(table: Any, file: str, key: str) -> dict[str, float]:
+    if not isinstance(table, dict) or not all(isinstance(v, int | float) for v in table.values()):
+        raise FormatError(file, key, "no table of numbers", f"write [{key}] and TRANSITION = NUMBER below it")
+    return {name: float(value) for name, value in table.items()}
+
+
+def unit_rates(model: NetFile) -> Gspn:
+    """Every transition with rate 1/s and one server."""
+    return Gspn.of(model.net, dict.fromkeys(model.net.transitions, 1.0))
+
+
+def analyse_command(
+    path: Path,
+    load_task: LoadTask,
+    *,
+    view: str = "ordinary",
+    rates: Path | str | None = None,
+    stages: int = 8,
+    limits: Limits | None = None,
+    engine: EngineName = "auto",
+    structure: bool = True,
+) -> Outcome:
+    """`petrobot analyse`: code 0 if bounded and free from deadlock, 1 if not (or unknown), 2 for bad input.
+
+    `rates` is a rates file, or "unit"; rates found in the net file itself are used when `view` is "gspn".
+    """
+    try:
+        model = open_model(path, load_task)
+        subject, name, notes = _subject(model, rates, view)
+        found = analyse(subject, name=name or path.stem, view=view, stages=stages, limits=limits, engine=engine)
+    except FormatError as error:
+        return Outcome(BAD_INPUT, str(error), {"error": str(error)})
+    data = found.to_json(structure=structure)
+    text = "\n".join([found.text(), *(f"note: {note}" for note in notes)])
+    return Outcome(OK if found.ok else FAULT, text, data | {"notes": [*data["notes"], *notes]})
+
+
+def _subject(model: Task | NetFile, rates: Path | str | None, view: str) -> tuple[Any, str, tuple[str, ...]]:
+    """(what to analyse, its name, notes)."""
+    if isinstance(model, Task):
+        return model, model.name, ()
+    if rates == "unit":
+        return unit_rates(model), model.name, (*model.notes, "every transition has the rate 1/s")
+    if rates is not None:
+        path = Path(rates)
+        return read_rates(_text(path), str(path), model), model.name, model.notes
+    if view == "gspn" and model.gspn is None:
+        raise FormatError(model.name or "net", "rates", "the file says none", "give --rates FILE, or --rates unit")
+    return (model.gspn if view == "gspn" else model.net), model.name, model.notes
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise FormatError(str(path), "file", str(error), "give a readable file") from error
+
+
+def simulate_command(
+    path: Path,
+    load_task: LoadTask,
+    random: np.random.Generator,
+    *,
+    rates: Path | str | None = None,
+    replicas: int = 1000,
+    horizon: float | None = None,
+    warmup: float = 0.0,
+    firings: int = 10_000_000,
+    stages: int = 64,
+    tokens: Mapping[str, int] | None = None,
+    progress: Callable[[int, float], None] | None = None,
+) -> Outcome:
+    """`petrobot simulate`: a task until it is final (or dead), a net until `horizon` (s; needed there). `tokens`: what if."""
+    try:
+        model = open_model(path, load_task)
+        if isinstance(model, Task):
+            view = stochastic_view(model, stages=stages, timer_stages=stages)
+            view = what_if(view, tokens) if tokens else view
+            ends = OrdinaryView(model)
+            goal = goal_by_marking(lambda m: ends.is_final(view.projected(m)))
+            seen = simulate(view.gspn, random, replicas=replicas, horizon=horizon or np.inf, warmup=warmup, goal=goal,
+                            firings=firings, progress=progress)  # fmt: skip
+            return _simulated(model.name, seen, view.assumptions)
+        subject, name, notes = _subject(model, rates, "gspn")
+        gspn: Gspn = subject.marked(tokens) if tokens else subject
+        if horizon is None:
+            raise FormatError(str(path), "horizon", "a net has no end of its own", "give --horizon SECONDS")
+        seen = simulate(
+            gspn, random, replicas=replicas, horizon=horizon, warmup=warmup, firings=firings, progress=progress
+        )
+        return _simulated(name or path.stem, seen, notes)
+    except (FormatError, NoEstimate, ValueError, KeyError) as error:
+        return Outcome(BAD_INPUT, str(error), {"error": str(error)})
+
+
+def _simulated(name: str, seen: Simulation, notes: tuple[str, ...]) -> Outcome:
+    def plain(one: Estimate) -> list[float]:
+        return [one.mean, one.low, one.high]
+
+    data: dict[str, Any] = {
+        "name": name,
+        "replicas": seen.replicas,
+        "firings": seen.firings,
+        "complete": seen.complete,
+        "throughput": {t: plain(one) for t, one in seen.throughput.items()},
+        "mean_tokens": {p: plain(one) for p, one in seen.mean_tokens.items()},
+        "notes": list(notes),
+    }
+    lines = [f"{name}: {seen.replicas} replicas, {seen.firings} firings" + ("" if seen.complete else " (cut short)")]
+    if seen.completed is not None:
+        data["completed"] = plain(seen.completed)
+        lines.append(f"  completed {_interval(seen.completed)}")
+    if seen.time is not None:
+        quantiles = {f"{q:g}": seen.quantile(q) for q in (0.5, 0.9, 0.99)}
+        data |= {"time": plain(seen.time), "quantiles": quantiles}
+        lines.append(f"  time {_interval(seen.time)} s; " + ", ".join(f"{q}: {t:.4g} s" for q, t in quantiles.items()))
+    if seen.completed is None:
+        lines += [f"  {t:24}{_interval(one)} /s" for t, one in seen.throughput.items()]
+    return Outcome(OK if seen.complete else FAULT, "\n".join([*lines, *(f"note: {n}" for n in notes)]), data)
+
+
+def _interval(one: Estimate) -> str:
+    return f"{one.mean:.6g} [{one.low:.6g}, {one.high:.6g}]"
+
+
+def convert_command(source: Path, target: Path, load_task: LoadTask, *, stages: int = 8) -> Outcome:
+    """`petrobot convert`: read one format, write another by the ending; what the target cannot keep is listed."""
+    try:
+        model = open_model(source, load_task)
+        if isinstance(model, Task):
+            model, lost = _exported(model, target, stages)
+        else:
+            lost = list(model.notes)
+        text, more = written(model, target.suffix)
+        target.write_text(text, encoding="utf-8")
+    except (FormatError, NoEstimate) as error:
+        return Outcome(BAD_INPUT, str(error), {"error": str(error)})
+    except OSError as error:
+        return Outcome(BAD_INPUT, f"{target}: {error.strerror or error}", {"error": str(error)})
+    lost += more
+    lines = [f"{source} -> {target}", *(f"not kept: {what}" for what in lost)]
+    return Outcome(OK, "\n".join(lines), {"source": str(source), "target": str(target), "not_kept": lost})
+
+
+def _exported(task: Task, target: Path, stages: int) -> tuple[NetFile, list[str]]:
+    """A task as a net file: its stochastic view where rates are needed (.drn), else its ordinary net."""
+    if target.suffix == ".drn":
+        view = stochastic_view(task, stages=stages, timer_stages=stages)
+        return NetFile(view.gspn.net, task.name, view.gspn), list(view.assumptions)
+    flat = task.flat
+    positions: dict[str, tuple[float, float]] = {}
+    labels: dict[str, str] = {}
+    for node in (*flat.places.values(), *flat.transitions.values()):
+        assert isinstance(node, Place | Transition)
+        if node.x is not None and node.y is not None:
+            positions[node.name] = (node.x, node.y)
+        if node.label:
+            labels[node.name] = node.label
+    lost = ["events, conditions, actions, times and priorities: a net file holds the ordinary view"]
+    return NetFile(task.net, task.name, None, labels, positions), lost
+
+
+def graph_command(
+    path: Path, load_task: LoadTask, *, witness: tuple[str, ...] | None = None, limits: Limits | None = None
+) -> Outcome:
+    """`petrobot show --graph`: the reachability graph as SVG in data["svg"]; by default with the first deadlock's witness."""
+    try:
+        model = open_model(path, load_task)
+    except FormatError as error:
+        return Outcome(BAD_INPUT, str(error), {"error": str(error)})
+    net, final = model.net, None
+    limits = limits or Limits(states=10_000)
+    space = explore(net, limits=limits)
+    if isinstance(model, Task):
+        final = space.where(OrdinaryView(model).is_end)
+    stuck = [int(i) for i in space.dead if final is None or not final[i]]
+    shown = witness if witness is not None else tuple(space.path(stuck[0])) if stuck else ()
+    svg = graph_svg(space, witness=shown, final=final)
+    partial = "" if space.complete else f" (partial: {space.reason})"
+    return Outcome(OK, f"{len(space)} markings, {space.edges} edges{partial}", {"svg": svg, "witness": list(shown)})
+
+
+def limited(limits: Limits, progress: Callable[[int, int], None]) -> Limits:
+    """The same limits with a progress callback (markings found, markings expanded)."""
+    return replace(limits, progress=progress)

@@ -1,0 +1,213 @@
+"""Whole analyses and the commands: promised keys, numbers in closed form, pictures, and one clear line for bad input."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from coordinator.analysis.commands import (
+    analyse_command,
+    convert_command,
+    graph_command,
+    read_rates,
+    simulate_command,
+    unit_rates,
+)
+from coordinator.analysis.forecast import forecast
+from coordinator.analysis.formats import read_net
+from coordinator.analysis.gspn import Gspn
+from coordinator.analysis.netfile import FormatError, NetFile
+from coordinator.analysis.picture import graph_svg
+from coordinator.analysis.pnml_writing import write_pnml
+from coordinator.analysis.report import analyse, heat
+from coordinator.analysis.space import Limits, explore
+from coordinator.analysis.stochastic import stochastic_view
+from coordinator.net import Net
+from coordinator.task import Estimate, Status
+from coordinator.taskfile import load
+from tests.analysis.generators import KANBAN_RATES, kanban, philosophers, queue
+
+CATCH = Path(__file__).parents[2] / "coordinator" / "tasks" / "catch_ball.toml"
+PROMISED = {
+    "net", "states", "edges", "complete", "bounded", "max_tokens_per_place", "max_tokens_in_marking", "safe", "deadlock",
+    "deadlocks", "quasi_live", "live", "reversible", "home_states",
+}  # fmt: skip
+NUMBERS = {"throughput", "mean_tokens", "residual"}
+
+
+def test_a_net_file_gives_the_promised_keys(tmp_path: Path) -> None:
+    path = tmp_path / "kanban.pnml"
+    path.write_text(write_pnml(NetFile(kanban(1))), encoding="utf-8")
+    plain = analyse_command(path, load)
+    assert plain.code == 0 and set(plain.data) >= PROMISED and not set(plain.data) & NUMBERS
+    data = json.loads(json.dumps(plain.data))
+    assert data["net"] == {"places": 16, "transitions": 16, "arcs": 40}
+    assert (data["states"], data["edges"], data["home_states"]) == (160, 616, 160)
+    assert (data["bounded"], data["safe"], data["deadlock"], data["live"], data["reversible"]) == (
+        True,
+        True,
+        False,
+        True,
+        True,
+    )
+    assert data["max_tokens_per_place"] == 1 and data["deadlocks"] == [] and data["structure"]["conservative"]
+    rates = tmp_path / "rates.toml"
+    rates.write_text("[rates]\n" + "".join(f"{k} = {v}\n" for k, v in KANBAN_RATES.items()), encoding="utf-8")
+    timed = analyse_command(path, load, view="gspn", rates=rates)
+    assert set(timed.data) >= PROMISED | NUMBERS
+    assert timed.data["throughput"]["tin1"] == pytest.approx(0.0925846346333826, abs=1e-12)
+    assert analyse_command(path, load, view="gspn", rates="unit").data["throughput"]["tin1"] > 0
+    bare = analyse_command(path, load, view="gspn")
+    assert bare.code == 2 and "--rates" in bare.text
+
+
+def test_deadlocks_are_told_with_replayable_witnesses() -> None:
+    found = analyse(philosophers(3))
+    data = found.to_json()
+    assert data["deadlock"] is True and not found.ok and len(data["deadlocks"]) == 2
+    for one in data["deadlocks"]:
+        *_, last = philosophers(3).replay(one["firings"])
+        assert not philosophers(3).enabled(last)
+    assert "NO" in found.text() and "hasleft0" in found.text()
+
+
+def test_a_partial_and_an_unbounded_net_are_owned_up_to() -> None:
+    part = analyse(kanban(3), limits=Limits(states=1000)).to_json()
+    assert (
+        part["complete"] is False and part["live"] is None and part["bounded"] is True and part["home_states"] is None
+    )
+    grows = Net.build({"p": 1}, {"t": ({"p": 1}, {"p": 2})})
+    data = analyse(Gspn.of(grows, {"t": 1.0}), view="gspn", limits=Limits(states=50)).to_json()
+    assert data["states"] is None and data["bounded"] is False and data["max_tokens_per_place"] is None
+    assert any("simulate instead" in note for note in data["notes"])
+
+
+def test_the_catching_task_in_one_analysis() -> None:
+    found = analyse(load(CATCH), view="gspn", stages=2)
+    data = json.loads(json.dumps(found.to_json()))
+    assert set(data) >= PROMISED | NUMBERS | {"recoveries", "forecast"}
+    assert data["bounded"] and data["live"] and data["reversible"] and data["sound"] and data["deadlock"] is False
+    assert data["judged_on_closed_net"] and {v["holds"] for k, v in data["verdicts"].items() if k != "safe"} == {True}
+    text = found.text()
+    assert "stable" in text and "controllable" in text and "recovered arm_back" in text and "P_complete" in text
+    assert 0 < max(heat(found).values()) <= 1
+
+
+def test_the_forecast_of_a_task_is_consistent() -> None:
+    """Firings per mission, conservation of runs, and what moving probability from ERROR to SUCCESS really does."""
+    task = load(CATCH)
+    found = forecast(stochastic_view(task, stages=1, timer_stages=1))
+    runs = found.firings["start"] + found.firings["no_images"]
+    assert runs == pytest.approx(4.0, rel=1e-4)
+    assert found.firings["located"] + found.firings["not_located"] == pytest.approx(found.firings["start"], rel=1e-9)
+    assert found.goal_reliability is not None and 0 < found.conjunctive_reliability < found.goal_reliability < 1
+    assert found.throughput["start"] * found.mission_time == pytest.approx(found.firings["start"])
+    assert found.mean_tokens["camera_free"] <= 1 and found.recovery_time > 0
+    shares = dict.fromkeys(task.net.places, 0.0)
+    for one in found.worth:
+        shares[one.place] += one.time_share
+    assert 0.5 < sum(shares.values()) < 1.0  # waits for events and timers take the rest
+    step, primitive = 1e-4, task.primitive_tasks["locate_ball"]
+    moved = dict(primitive.estimates)
+    moved[Status.SUCCESS] = replace(moved[Status.SUCCESS], share=moved[Status.SUCCESS].share + step)
+    moved[Status.ERROR] = replace(moved[Status.ERROR], share=moved[Status.ERROR].share - step)
+    better = replace(task, primitive_tasks={**task.primitive_tasks, "locate_ball": replace(primitive, estimates=moved)})
+    after = forecast(stochastic_view(better, stages=1, timer_stages=1))
+    goals = sum(w.goal_gain for w in found.worth if w.place == "locate_ball")
+    assert after.goal_reliability is not None
+    assert (after.goal_reliability - found.goal_reliability) * 4 / step == pytest.approx(goals, rel=1e-2)
+
+
+def test_a_faster_action_saves_the_time_that_the_forecast_says() -> None:
+    task, factor = load(CATCH), 0.999
+    found = forecast(stochastic_view(task, stages=1, timer_stages=1))
+    primitive = task.primitive_tasks["return_home"]
+    quicker = {s: Estimate(e.share, e.mean * factor, e.cv) for s, e in primitive.estimates.items()}
+    other = replace(
+        task, primitive_tasks={**task.primitive_tasks, "return_home": replace(primitive, estimates=quicker)}
+    )
+    after = forecast(stochastic_view(other, stages=1, timer_stages=1))
+    share = next(w.time_share for w in found.worth if w.place == "return_home")
+    assert (found.done.mean - after.done.mean) / found.done.mean / (1 - factor) == pytest.approx(share, rel=1e-2)
+
+
+def test_simulation_and_solution_of_the_catching_task_agree() -> None:
+    exact = forecast(stochastic_view(load(CATCH), stages=3, timer_stages=3))
+    seen = simulate_command(CATCH, load, np.random.default_rng(5), replicas=400, stages=3)
+    assert seen.code == 0
+    mean, low, high = seen.data["time"]
+    assert low - (high - low) < exact.done.mean < high + (high - low)
+    assert seen.data["quantiles"]["0.9"] == pytest.approx(exact.law().quantile(0.9), rel=0.1)
+    fewer = simulate_command(CATCH, load, np.random.default_rng(5), replicas=200, stages=3, tokens={"runs": 1})
+    assert fewer.data["time"][0] < mean / 2
+
+
+def test_simulating_a_net_needs_a_horizon_and_rates(tmp_path: Path) -> None:
+    gspn = Gspn.of(queue(5), {"arrive": 0.8, "serve": 1.0})
+    path = tmp_path / "queue.pnml"
+    path.write_text(write_pnml(NetFile(gspn.net, "queue", gspn)), encoding="utf-8")
+    assert simulate_command(path, load, np.random.default_rng(1)).code == 2
+    seen = simulate_command(path, load, np.random.default_rng(1), replicas=200, horizon=300.0, warmup=20.0)
+    mean, low, high = seen.data["throughput"]["serve"]
+    assert low - 0.01 < 0.7289444010755486 < high + 0.01 and mean > 0
+    assert "serve" in seen.text
+
+
+def test_converting_lists_what_is_not_kept(tmp_path: Path) -> None:
+    target = tmp_path / "catch.pnml"
+    outcome = convert_command(CATCH, target, load)
+    assert outcome.code == 0 and any("events" in what for what in outcome.data["not_kept"])
+    assert explore(read_net(target).net).edges == explore(load(CATCH).net).edges
+    assert convert_command(target, tmp_path / "catch.net", load).code == 0
+    assert convert_command(target, tmp_path / "catch.xyz", load).code == 2
+    assert convert_command(CATCH, tmp_path / "no" / "where.pnml", load).code == 2
+    chain = convert_command(tmp_path / "catch.pnml", tmp_path / "catch.drn", load)
+    assert chain.code == 2 and "rates" in chain.text
+
+
+def test_the_graph_is_a_picture_with_the_witness_in_it(tmp_path: Path) -> None:
+    path = tmp_path / "philosophers.pnml"
+    path.write_text(write_pnml(NetFile(philosophers(3))), encoding="utf-8")
+    outcome = graph_command(path, load)
+    root = ElementTree.fromstring(outcome.data["svg"])
+    groups = [g.get("class") or "" for g in root.iter("{http://www.w3.org/2000/svg}g")]
+    assert sum(g.startswith("m") for g in groups) == 27 and sum("dead" in g for g in groups) == 2
+    assert sum(g == "e on" for g in groups) == len(outcome.data["witness"]) == 3
+    task = graph_command(CATCH, load)
+    assert "final" in task.data["svg"] and task.data["witness"] == []
+    with pytest.raises(ValueError, match="no such edge"):
+        graph_svg(explore(philosophers(3)), witness=("done0",))
+    cut = graph_svg(explore(philosophers(6)), markings=50)
+    assert "50 of 729 markings shown" in cut
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[rates]\nnobody = 1.0", "no transition"),
+        ("[rates]\narrive = 'fast'", "no table of numbers"),
+        ("rates = 3", "no table of numbers"),
+        ("[rate]\narrive = 1", "unknown key"),
+        ("[rates", "TOML"),
+        ("[rates]\narrive = -1.0\nserve = 1.0", "positive"),
+    ],
+)
+def test_bad_rates_files_say_what_is_wrong(text: str, said: str) -> None:
+    with pytest.raises(FormatError, match=said):
+        read_rates(text, "rates.toml", NetFile(queue(2)))
+
+
+def test_rates_files() -> None:
+    gspn = read_rates("default_rate = 2.0\n[rates]\narrive = 1\n[servers]\nserve = 'infinite'", "r", NetFile(queue(2)))
+    assert gspn.rate == (1.0, 2.0) and gspn.servers == (1, None)
+    assert unit_rates(NetFile(queue(2))).rate == (1.0, 1.0)
+
+
+def test_missing_files_are_one_line(tmp_path: Path) -> None:
+    outcome = analyse_command(tmp_path / "missing.pnml", load)
+    assert outcome.code == 2 and "\n" not in outcome.text and "missing.pnml" in outcome.text
