@@ -50,7 +50,9 @@ class CoordinatorParty:
         """Begin once every node has welcomed us; then do what is due."""
         mission, self._now = self.mission, now
         for node, caller in mission.callers.items():
-            caller.advance(now)
+            if now >= caller.soonest:
+                caller.advance(now)
+                caller.due()  # keeps `soonest` up to date
             if notices := caller.notices():
                 mission.take(now, node, notices)
         mission.advance(now)

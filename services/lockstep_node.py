@@ -88,6 +88,8 @@ class LockstepNode:
 
     def drain(self) -> Sequence[Envelope]:
         """What was sent since the last call, in order."""
+        if not self._out:
+            return ()
         out = list(self._out)
         self._out.clear()
         return out

@@ -116,6 +116,8 @@ class LockstepPorts:
 
     def raised(self) -> list[tuple[str, Mapping[str, Any]]]:
         """Events raised since the last call, in order."""
+        if not self._raised:
+            return []
         raised, self._raised = self._raised, []
         return raised
 

@@ -128,9 +128,7 @@ class Node:
     def advance(self, now: float) -> None:
         """Do all that is due: orders of callers, runs, devices, timers, and what comes of them."""
         self._now = now
-        self.callee.advance(now)
-        for caller in self.callers.values():
-            caller.advance(now)
+        self._advance_ends(now)
         self.obey(now, self.callee.orders())
         self._answer_runs(now)
         for name in self._timers.advance(now):
@@ -141,6 +139,14 @@ class Node:
                 self._take_report(now, key, report)
         self._answer_runs(now)
         self._answer_commands(now)
+
+    def _advance_ends(self, now: float) -> None:
+        """What time does at both ends of calls; asking for the next due time keeps `soonest` up to date."""
+        ends: tuple[Callee | Caller, ...] = (self.callee, *self.callers.values())
+        for end in ends:
+            if now >= end.soonest:
+                end.advance(now)
+                end.due()
 
     def due(self) -> float | None:
         """When `advance` has something to do at the latest (s), None if only what comes in can matter."""
@@ -190,6 +196,8 @@ class Node:
                 self.places[key].command(now, command.id, command.verb)
 
     def _answer_commands(self, now: float) -> None:
+        if not self._commands:
+            return
         for id_, command in list(self._commands.items()):
             if not command.missing or now >= command.due:
                 del self._commands[id_]
@@ -250,7 +258,9 @@ class Node:
 
     def _answer_runs(self, now: float) -> None:
         for caller in self.callers.values():
-            self.take_notices(now, caller.notices())
+            notices = caller.notices()
+            if notices:
+                self.take_notices(now, notices)
 
     def take_notices(self, now: float, notices: Iterable[Notice]) -> None:
         """Hand the ends of calls to the runs that made them."""

@@ -102,6 +102,8 @@ class Runner:
 
     def reports(self) -> list[Report]:
         """What happened since the last call, in order."""
+        if not self._reports:
+            return []
         reports, self._reports = self._reports, []
         return reports
 
@@ -117,7 +119,10 @@ class Runner:
 
     def advance(self, now: float) -> None:
         """Do all that is due: begin, go on, stop, end."""
-        self._look_at_fence()
+        if self._fenced:
+            self._look_at_fence()
+        if not self._runs:  # nor is a stream open: a run closes its own when it ends
+            return
         held = self._held_since is not None
         for run in list(self._runs.values()):
             if not held and run.phase not in _AFTER:
