@@ -59,7 +59,7 @@ class InlinePlace:
         self._cyclic = CyclicDriver(driver) if driver is not None and driver.period else None
         self._remote = RemoteDriver(self._post, clock)
         if self._cyclic is not None:
-            self._remote.take(self._cyclic.state())
+            self._remote.expect(self._cyclic.state)
         self._commands: list[DeviceCommand] = []
         self._next_step: float | None = None
         self._told: list[Report] = []
@@ -136,7 +136,8 @@ class InlinePlace:
             commands, self._commands = self._commands, []
             for command in commands:
                 self._cyclic.take(now, command)
-            self._remote.take(self._cyclic.step(now))
+            self._driver.step(now)
+            self._remote.expect(self._cyclic.state)
             due += self._driver.period
         self._next_step = due
 
@@ -147,8 +148,11 @@ class InlinePlace:
 
     def reports(self) -> list[Report]:
         """What happened since the last call, in order."""
-        told, self._told = self._told, []
-        return [*self._runner.reports(), *told]
+        reports = self._runner.reports()
+        if self._told:
+            reports += self._told
+            self._told = []
+        return reports
 
     def close(self, now: float) -> None:
         """Stop routine, then let the device go."""

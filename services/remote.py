@@ -36,15 +36,23 @@ class DeviceState:
 class RemoteDriver:
     """The actions' end: implements `services.device.Remote` for them and `services.runner.DeviceControl` for the runner.
 
-    `post` sends a command; `take` is given each newer state.
+    `post` sends a command; `take` is given each newer state. Where the driver lives in the same process, `expect` is told
+    instead where to get it: nothing is put together that nobody looks at.
     """
 
     def __init__(self, post: Callable[[DeviceCommand], None], clock: Callable[[], float]) -> None:
         self._post = post
         self._clock = clock
         self._sent = 0
-        self._newest = DeviceState()
+        self._taken = DeviceState()
+        self._source: Callable[[], DeviceState] | None = None
         self._arrived = -float("inf")
+
+    @property
+    def _newest(self) -> DeviceState:
+        if self._source is not None:
+            self._taken, self._source = self._source(), None
+        return self._taken
 
     @property
     def handle(self) -> RemoteDriver:
@@ -85,7 +93,11 @@ class RemoteDriver:
 
     def take(self, state: DeviceState) -> None:
         """A newer state came in."""
-        self._newest, self._arrived = state, self._clock()
+        self._taken, self._source, self._arrived = state, None, self._clock()
+
+    def expect(self, source: Callable[[], DeviceState]) -> None:
+        """A newer state is there; `source` gives it when it is wanted."""
+        self._source, self._arrived = source, self._clock()
 
     def _number(self, verb: str, body: Mapping[str, Any]) -> int:
         self._sent += 1

@@ -19,6 +19,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import sub
 from typing import Any, Final
 
 import numpy as np
@@ -116,6 +117,7 @@ class Arm:
         self._measured = [0.0] * JOINTS
         self._measured_speed = [0.0] * JOINTS
         self._cycles = 0
+        self._now = ports.now
         self._drive_speeds = self._master.speeds
         self._commands: dict[str, Callable[[float, Mapping[str, Any]], None]] = {
             "move": self._move,
@@ -136,6 +138,7 @@ class Arm:
     def step(self, now: float) -> None:
         """One cycle."""
         self._cycles += 1
+        self._now = now
         try:
             frames = self._bus.receive()
         except ConnectionError as reason:
@@ -180,7 +183,7 @@ class Arm:
             "setpoints_refused": follower.refused,
             "oldest_executed": follower.oldest,
             "stale_executed": follower.stale,
-            "plan": follower.published(self._ports.now),
+            "plan": follower.published(self._now),
             "cycles": self._cycles,
         }
 
@@ -281,7 +284,7 @@ class Arm:
             self._drive_speeds = self._master.speeds
             self._steering.limit(self._speeds())
         moves = not (self._trajectory.still and self._standing())
-        if moves and not self._master.limited and self._lag() > LOST:
+        if moves and not self._master.limited and self._lost():
             self._master.give_up(f"the joints are more than {LOST} rad off the commanded path")
             return
         if self._mode == "follow":
@@ -333,6 +336,10 @@ class Arm:
             return 0.0
         return min(map(self._off_by, self._commanded))
 
+    def _lost(self) -> bool:
+        """Whether the measured joints are too far off all of that path; most often the first look settles it."""
+        return bool(self._commanded) and all(self._off_by(q) > LOST for q in self._commanded)
+
     def _in_place(self) -> bool:
         """Whether the measured joints are where they are wanted: at the end of a move, or at the newest plan's pose."""
         if self._mode == "follow":
@@ -342,7 +349,8 @@ class Arm:
         return self._mode == "move" and goal is not None and self._steering.arrived and self._off_by(goal) < IN_PLACE
 
     def _off_by(self, q: Sequence[float]) -> float:
-        return max(abs(a - b) for a, b in zip(q, self._measured, strict=True))
+        farthest: float = max(map(abs, map(sub, q, self._measured)))
+        return farthest
 
     def _standing(self) -> bool:
         return max(map(abs, self._measured_speed)) < _STANDING
