@@ -49,7 +49,7 @@ STOP_CYCLES: Final = 125
 SPEED_POLL: Final = 1.0
 """Seconds between two looks at a drive's greatest speed."""
 LIMITED_POLL: Final = 0.02
-"""The same while the drive says that it is too slow for its set points."""
+"""The same while a drive says that it is too slow for its set points."""
 SETTLE: Final = 0.05
 """Seconds that nodes are given after a reset of their communication."""
 INPUT_TIMER_MS: Final = 100
@@ -149,12 +149,12 @@ class DriveLink:
         """Whether the drive cuts its set points because they are faster than it goes."""
         return bool(self.statusword & StatusBit.INTERNAL_LIMIT)
 
-    def ask_speed(self, now: float) -> list[Frame]:
-        """Read the drive's greatest speed again when it is time, sooner if it is `limited`: drives may slow down by themselves."""
+    def ask_speed(self, now: float, hurry: bool) -> list[Frame]:
+        """Read the drive's greatest speed again when it is time, sooner in a hurry: drives may slow down by themselves."""
         if self.sdo.busy:
             return self.sdo.advance(now)
         self.max_speed = from_units(self.sdo.results.get((Object.MAX_SPEED, 0), to_units(self.max_speed)))
-        if now - self._asked < (LIMITED_POLL if self.limited else SPEED_POLL):
+        if now - self._asked < (LIMITED_POLL if hurry else SPEED_POLL):
             return []
         self._asked = now
         self.sdo.begin([Transfer(Object.MAX_SPEED, 0, _U32)])
@@ -282,8 +282,9 @@ class DriveMaster:
                 for drive, target in zip(self.drives, targets, strict=True)
             ]
             frames.append(canopen.SYNC)
+            hurry = self.limited
             for drive in self.drives:
-                frames += drive.ask_speed(now)
+                frames += drive.ask_speed(now, hurry)
         return frames
 
     def _configure(self, now: float) -> list[Frame]:

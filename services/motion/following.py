@@ -14,6 +14,11 @@ STALE_PERIODS: Final = 3
 """Periods of the stream after which a set point is not executed any more."""
 FROZEN: Final = 0.03
 """s before the ball from which the cup keeps still: what can still be corrected is less than what a moving rim can spoil."""
+SAME_PLACE: Final = 0.0003
+"""m, SAME_SPEED m/s, SAME_TIME s: what two predictions may differ by and still lead to one plan; 0.5 mm at the cup."""
+SAME_SPEED: Final = 0.002
+SAME_TIME: Final = 0.002
+SAME_SIGMA: Final = 0.002
 ROUNDING: Final = 1e-9
 """s by which rounding may carry an age."""
 
@@ -27,6 +32,8 @@ class Follower:
         self.plan: Plan | None = None
         self._made = 0.0
         self._prediction: Prediction | None = None
+        self._planned: Prediction | None = None
+        self._planned_for = self.strategy
         self._values: tuple[float, ...] | None = None
         self.count = 0
         self.age = math.inf
@@ -81,7 +88,7 @@ class Follower:
     ) -> Plan | None:
         """Plan for the prediction just taken; None if it cannot be reached (the plan of before is forgotten)."""
         assert self._prediction is not None
-        if self.plan is not None and self.plan.arrival - (now - self._made) < FROZEN:
+        if self.plan is not None and (self.plan.arrival - (now - self._made) < FROZEN or self._says_the_same(now)):
             return self.plan
         self.plan = interceptor.plan(
             self.strategy,
@@ -92,8 +99,19 @@ class Follower:
             acceleration,
             self.plan,
         )
-        self._made = now
+        self._made, self._planned, self._planned_for = now, self._prediction, self.strategy
         return self.plan
+
+    def _says_the_same(self, now: float) -> bool:
+        """Whether the newest prediction differs from the planned one by less than is worth a new plan."""
+        new, old = self._prediction, self._planned
+        if new is None or old is None or self.strategy != self._planned_for:
+            return False
+        apart = max(abs(a - b) for a, b in zip(new.point, old.point, strict=True))
+        faster = max(abs(a - b) for a, b in zip(new.velocity, old.velocity, strict=True))
+        later = abs(new.time_to_go + now - old.time_to_go - self._made)
+        surer = old.sigma_y - new.sigma_y
+        return apart < SAME_PLACE and faster < SAME_SPEED and later < SAME_TIME and surer < SAME_SIGMA
 
     def published(self, now: float) -> dict[str, Any] | None:
         """The plan as plain data: times are seconds from `now`."""

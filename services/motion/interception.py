@@ -62,7 +62,7 @@ class Strategy:
     depths: tuple[float, ...]
     preferred: float
     opening: float
-    hands: tuple[float, ...] = tuple(math.radians(angle) for angle in range(-90, 91, 15))
+    hands: tuple[float, ...] = tuple(math.radians(angle) for angle in range(-90, 91, 18))
     margin: float = 0.03
     """Seconds by which the arm wants to be there before the ball: the drives' lag and settling."""
 

@@ -47,6 +47,7 @@ class Guard:
         """Margins (m) are between cup and table, and of everything else; they cover what happens between the poses looked at."""
         self._cup_margin, self._arm_margin = cup_margin, arm_margin
         self._puma = puma
+        self._model = model
         self._body = model.body
         self._cell = cell
         self._limits = list(zip(model.lower.tolist(), model.upper.tolist(), strict=True))
@@ -58,6 +59,10 @@ class Guard:
         )
         self._swing = max(ends) + self._radius
         """m from the wrist's centre within which the whole cup is."""
+
+    def closer(self, share: float) -> Guard:
+        """A guard that keeps only a share of the margins."""
+        return Guard(self._puma, self._model, self._cell, share * self._cup_margin, share * self._arm_margin)
 
     def place(self, q: Sequence[float]) -> Placement:
         """Where forearm and cup are in a joint pose."""
@@ -140,8 +145,7 @@ class Guard:
     def advance(self, trajectory: Trajectory) -> str:
         """Move a trajectory on by one cycle; gives what it refused to touch, in words, empty if it went on as it wished.
 
-        An arm that is found in a pose that is not clear (it was switched on there) may leave it, but only at a speed that
-        the caller has limited.
+        It brakes where it refuses; that this way is clear holds if the guard has watched from a clear pose on.
         """
         q, qd = trajectory.proposed()
         rest = trajectory.resting(q, qd)
@@ -149,11 +153,8 @@ class Guard:
         if any(abs(b - a) > NEAR for a, b in zip(q, rest, strict=True)):
             for share in LOOKS:
                 refused = refused or self.violation(trajectory.stopping(q, qd, share))
-        if refused and not self.violation(trajectory.resting(trajectory.q, trajectory.qd)):
-            trajectory.accept(*trajectory.braking())
-            return refused
-        trajectory.accept(q, qd)
-        return ""
+        trajectory.accept(*(trajectory.braking() if refused else (q, qd)))
+        return refused
 
 
 class _Turn:

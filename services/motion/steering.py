@@ -11,6 +11,10 @@ from services.motion.limits import Guard
 from services.motion.model import Vector
 from services.motion.trajectory import Trajectory, synchronised
 
+CREEP: Final = 0.1
+"""Share of the greatest speeds at which an arm leaves a pose that it should not be in."""
+CLOSER: Final = 0.4
+"""Share of the guard's margins that is kept on a way round."""
 LOOK: Final = 3
 """Cycles on a way round before the straight way is looked at again."""
 
@@ -26,7 +30,9 @@ class Steering:
     def __init__(
         self, guard: Guard, retreat: Retreat, home: Sequence[float], period: float, acceleration: Vector
     ) -> None:
+        """`acceleration` (rad/s^2, (6,)) are the joints' greatest; speeds are set by `limit`."""
         self._guard = guard
+        self._close_guard = guard.closer(CLOSER)
         self._retreat = retreat
         self._home = tuple(home)
         self._acceleration = acceleration
@@ -36,6 +42,8 @@ class Steering:
         self.refused = ""
         """What the last step was refused for; empty if it was not."""
         self._via: tuple[float, ...] | None = None
+        self._given_up = 0
+        self._creeps = False
         self._together = False
         self._share = 1.0
         self._cycles = 0
@@ -55,6 +63,8 @@ class Steering:
 
     def chase(self, goal: Sequence[float]) -> None:
         """Go to a joint pose in haste; may be called in any cycle with another one."""
+        if tuple(goal) == self.goal and not self._together:
+            return
         self._share, self._together, self.goal = 1.0, False, tuple(goal)
         self._go_by(None if self._guard.path_clear(self._rest(), goal) else self._way_round(goal))
 
@@ -75,16 +85,38 @@ class Steering:
             trajectory.accept(*trajectory.braking())
             return
         if self._via is not None and self._cycles % LOOK == 0:
-            if self._guard.path_clear(self._rest(), self.goal):
-                self._go_by(None)
-            elif trajectory.still:
-                self._go_by(self._way_round(self.goal))
+            self._look_again(self.goal)
         trajectory.aim(self.goal if self._via is None else self._via)
         if self._via is None and trajectory.arrived(0.0):
             return
-        self.refused = self._guard.advance(trajectory)
+        self.refused = self._guarded()
         if self.refused and self._via is None:
             self._go_by(self._way_round(self.goal))
+
+    def _guarded(self) -> str:
+        """One step past the guard that the arm's present way to rest satisfies; on a way round the closer one. An arm that was
+        switched on where neither is satisfied may leave, creeping."""
+        trajectory, rest = self.trajectory, self._rest()
+        if self._via is None and not self._creeps and not self._guard.violation(rest):
+            return self._guard.advance(trajectory)
+        if not self._close_guard.violation(rest):
+            if self._creeps:
+                self._creeps = False
+                self._choose_limits()
+            return self._close_guard.advance(trajectory)
+        self._creeps = True
+        trajectory.limit((CREEP * self._speed).tolist(), self._acceleration.tolist())
+        trajectory.accept(*trajectory.proposed())
+        return ""
+
+    def _look_again(self, goal: Sequence[float]) -> None:
+        """Leave the way round if the straight way is clear; take another one where it has come to its end or is refused."""
+        if self._guard.path_clear(self._rest(), goal):
+            self._given_up = 0
+            self._go_by(None)
+        elif self.trajectory.still:
+            self._given_up += 1
+            self._go_by(self._way_round(goal))
 
     @property
     def arrived(self) -> bool:
@@ -105,19 +137,20 @@ class Steering:
         self._choose_limits()
 
     def _choose_limits(self) -> None:
-        """On a move or a way round all joints come to its end together, so that the way is straight; from motion nearly so."""
-        speed, acceleration = self._speed * self._share, self._acceleration * self._share
+        """On a move or a way round all joints come to its end together, so that the way is straight; a joint that moves already
+        keeps its whole acceleration, to turn round in time."""
+        speed, acceleration = self._speed * self._share, self._acceleration * (self._share if self._together else 1.0)
         end = self._via or self.goal
         if end is not None and (self._together or self._via is not None):
-            speed, acceleration = synchronised(np.subtract(end, self._rest()), speed, acceleration)
-        elif not self._together:
-            acceleration = self._acceleration
+            speed, gentle = synchronised(np.subtract(end, self._rest()), speed, acceleration)
+            acceleration = gentle if self.trajectory.still else acceleration
         self.trajectory.limit(speed.tolist(), acceleration.tolist())
 
     def _way_round(self, goal: Sequence[float]) -> tuple[float, ...]:
-        """Where to go first when the straight way is not clear: to before the goal, back from the table, or home."""
+        """Where to go first when the straight way is not clear: to before the goal, back from the table, or home. Those that
+        were given up before come last."""
         rest = self._rest()
-        for via in (self._retreat(goal), self._retreat(rest)):
-            if via is not None and self._guard.path_clear(rest, via):
-                return via
-        return self._home
+        ways = [way for way in (self._retreat(goal), self._retreat(rest), self._home) if way is not None]
+        turn = self._given_up % len(ways)
+        ways = ways[turn:] + ways[:turn]
+        return next((way for way in ways if self._close_guard.path_clear(rest, way)), ways[0])

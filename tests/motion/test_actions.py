@@ -11,6 +11,9 @@ import pytest
 from services.action import Status
 from services.comm.cia402 import Fault
 from services.motion import actions
+from services.motion.kinematics import Puma
+from services.motion.limits import Guard
+from services.motion.model import nominal_arm, nominal_cell
 
 FALL = math.sqrt(2 * 0.055 / 9.81)
 
@@ -199,14 +202,26 @@ def test_reset_and_home_says_why_it_cannot(play: Any) -> None:
     assert result.cause in ("drive_fault", "power", "arm_timeout")
 
 
-def test_a_pose_behind_the_table_is_a_timeout_with_its_reason(make_rig: Any, make_play: Any) -> None:
-    rig = make_rig(start=[math.radians(angle) for angle in (18.7, 90.0, -90.0, 0.0, 0.0, 0.0)]).enable()
+def test_an_arm_that_cannot_get_home_past_the_table_says_so_and_does_not_touch_it(
+    make_rig: Any, make_play: Any
+) -> None:
+    rig = make_rig(start=[math.radians(angle) for angle in (0.0, 90.0, -90.0, 0.0, 0.0, 0.0)]).enable()
+    arm = nominal_arm()
+    bare = Guard(Puma.of(arm), arm, nominal_cell(), cup_margin=0.0, arm_margin=0.0)
     play = make_play(rig)
-    result = play.play(actions.reset_and_home(play, timeout=6.0, speed=1.0))
-    assert result.status is Status.ERROR
-    assert result.cause == "arm_timeout"
+    result = play.play(actions.reset_and_home(play, timeout=5.0, speed=0.7))
+    assert (result.status, result.cause) == (Status.ERROR, "arm_timeout")
     assert "table" in result.text
     assert rig.arm.state()["faults"] == []
+    assert not any(bare.violation(q) for q in rig.commanded)
+
+
+def test_a_pose_that_is_not_reached_in_time_is_an_error(play: Any) -> None:
+    play.rig.arm.command(play.now, {"do": "move", "pose": "empty"})
+    play.rig.run(0.8)
+    result = play.play(actions.empty_and_home(play, timeout=0.3, speed=0.3))
+    assert (result.status, result.cause) == (Status.ERROR, "arm_timeout")
+    assert "home not reached in time: still under way" in result.text
 
 
 def test_actions_that_find_the_drives_off_say_so(make_rig: Any, make_play: Any) -> None:

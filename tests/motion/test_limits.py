@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from services.motion.kinematics import Puma
 from services.motion.limits import Guard
 from services.motion.model import nominal_arm, nominal_cell
+from services.motion.steering import Steering
 from services.motion.trajectory import Trajectory
 
 ARM, CELL = nominal_arm(), nominal_cell()
@@ -98,11 +99,24 @@ def test_a_refused_step_is_reported_and_the_arm_stops_before_the_table() -> None
     assert np.abs(trajectory.qd).max() < 0.1
 
 
-def test_an_arm_switched_on_in_a_forbidden_pose_may_leave_it() -> None:
+def test_an_arm_switched_on_in_a_forbidden_pose_may_leave_it_creeping() -> None:
     stuck = np.radians([18.7, 30.0, -190.0, 6.7, 48.6, 3.4])
-    trajectory = Trajectory(stuck.tolist(), 0.004, ARM.speed.tolist(), ARM.acceleration.tolist())
-    trajectory.aim(HOME.tolist())
-    for _ in range(300):
-        GUARD.advance(trajectory)
-    assert trajectory.arrived()
-    assert GUARD.violation(trajectory.q) == ""
+    steering = Steering(GUARD, lambda q: None, HOME.tolist(), 0.004, ARM.acceleration)
+    steering.limit(ARM.speed.tolist())
+    steering.reset(stuck.tolist())
+    steering.move(HOME.tolist())
+    fastest = np.zeros(6)
+    for _ in range(1000):
+        before = GUARD.violation(steering.trajectory.q)
+        steering.cycle()
+        if before:
+            fastest = np.maximum(fastest, np.abs(steering.trajectory.qd))
+    assert steering.arrived
+    assert np.all(fastest <= 0.1 * ARM.speed + 1e-9)
+
+
+def test_a_closer_guard_lets_pass_what_a_wider_one_refuses() -> None:
+    wide = Guard(PUMA, ARM, CELL, cup_margin=0.10, arm_margin=0.10)
+    assert GUARD.violation(HOME.tolist()) == ""
+    assert wide.violation(HOME.tolist()) == "cup at the table"
+    assert wide.closer(0.05).violation(HOME.tolist()) == ""
