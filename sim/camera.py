@@ -8,6 +8,7 @@ Lengths in m, base frame; pixels are (u, v), u to the right, whole numbers at pi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -99,10 +100,15 @@ class PinholeCamera:
         self.position: Array = np.asarray(camera["position"] if view.position is None else view.position, float)
         self.rotation: Array = _looking_down(camera) if view.rotation is None else np.asarray(view.rotation, float)
         self._rng = rng
+        self._lamp = (self.rotation @ LIGHT_DIRECTION).astype(np.float32)
+        outer = RING * (self.cup_radius + CUP_WALL)
+        self._cup_rings: Array = np.concatenate([outer, outer - (0.0, 0.0, self.cup_depth), RING * self.cup_radius])
         self._covered: tuple[bytes, list[_Cover]] = (b"", [])
         sigma = float(camera["noise"] if view.noise is None else view.noise)
         field = NOISE_ZERO + sigma * rng.standard_normal((NOISE_SIZE, NOISE_SIZE), np.float32)
         self._noise: Picture = np.clip(np.rint(field), 0, 255).astype(np.uint8)
+        self._brighter: Picture = np.maximum(self._noise, NOISE_ZERO) - np.uint8(NOISE_ZERO)
+        self._darker: Picture = np.uint8(NOISE_ZERO) - np.minimum(self._noise, NOISE_ZERO)
 
     def reseed(self, rng: np.random.Generator) -> None:
         """Choose noise by another generator from now on."""
@@ -116,14 +122,19 @@ class PinholeCamera:
 
     def project(self, points: ArrayLike) -> Array:
         """Pixels (..., 2) of base-frame points (..., 3)."""
-        seen = self.to_camera(points)
+        return self._pixels(self.to_camera(points))
+
+    def _pixels(self, seen: Array) -> Array:
+        """Pixels (..., 2) of points (..., 3) in the camera's frame."""
         x, y = seen[..., 0] / seen[..., 2], seen[..., 1] / seen[..., 2]
         k1, k2, p1, p2 = self.distortion
         square = x * x + y * y
         radial = 1.0 + square * (k1 + k2 * square)
         u = x * radial + 2.0 * p1 * x * y + p2 * (square + 2.0 * x * x)
         v = y * radial + p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y
-        return np.stack([self.focal * u + self.cx, self.focal * v + self.cy], axis=-1)
+        pixels = np.empty((*u.shape, 2))
+        pixels[..., 0], pixels[..., 1] = self.focal * u + self.cx, self.focal * v + self.cy
+        return pixels
 
     def rays(self, pixels: Array) -> Array:
         """Unit directions (..., 3), camera frame, in which pixels (..., 2) look; fixed-point inverse of the distortion."""
@@ -238,59 +249,60 @@ class PinholeCamera:
         """Light and noise over the whole image: a window of the noise field that the generator chooses."""
         row = int(self._rng.integers(NOISE_SIZE - self.height + 1))
         column = int(self._rng.integers(NOISE_SIZE - self.width + 1))
-        noise = self._noise[row : row + self.height, column : column + self.width]
+        window = slice(row, row + self.height), slice(column, column + self.width)
+        if light == 1.0:  # the same sum in a third of the time
+            cv2.add(picture, self._brighter[window], picture)
+            return np.asarray(cv2.subtract(picture, self._darker[window], picture), np.uint8)
+        noise = self._noise[window]
         return np.asarray(cv2.addWeighted(picture, light, noise, 1.0, -NOISE_ZERO), np.uint8)
 
     # Moving things
 
     def _paint_ball(self, picture: Picture, ball: Array, velocity: Array) -> None:
-        radius = self.ball_radius
-        (u, v), depth = self.project(ball), float(self.to_camera(ball)[2])
-        travel = self.project(ball + 0.5 * self.exposure * velocity) - (u, v)
-        reach = 2.2 * radius * self.focal / depth
-        box = self._box(u, v, reach + abs(travel[0]), reach + abs(travel[1]))
+        foot = ball - LIGHT_DIRECTION * ((ball[2] - self.table.top) / LIGHT_DIRECTION[2])
+        seen = self.to_camera(np.array((ball, ball + 0.5 * self.exposure * velocity, foot)))
+        (u, v), (later_u, later_v), (foot_u, foot_v) = self._pixels(seen).tolist()
+        travel_u, travel_v = later_u - u, later_v - v
+        reach = 2.2 * self.ball_radius * self.focal / float(seen[0, 2])
+        box = self._box(u, v, reach + abs(travel_u), reach + abs(travel_v))
         if box is None:
             return
-        rows, columns = box
-        region = picture[rows, columns].astype(np.float32)
-        light = self.illumination[rows, columns]
-        region *= self._shadow(ball, rows, columns)
-        cover, shade = self._sphere(ball, velocity, float(np.hypot(*travel)), rows, columns)
-        region *= 1.0 - cover
-        region += shade * (BALL_GREY * light)
-        picture[rows, columns] = np.clip(np.rint(region), 0, 255).astype(np.uint8)
+        region = picture[box].astype(np.float32)
+        if self.table.contains(foot[0], foot[1]) and 0.0 < ball[2] - self.table.top < 0.2:
+            region *= _shadow(foot_u, foot_v, self.ball_radius * self.focal / float(seen[2, 2]), box)
+        near = self._box(u, v, 0.6 * reach + 2.0 + abs(travel_u), 0.6 * reach + 2.0 + abs(travel_v))
+        if near is not None:
+            (top, left), (rows, columns) = (box[0].start, box[1].start), near
+            part = region[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left]
+            cover, shade = self._sphere(seen[0], self.rotation @ velocity, math.hypot(travel_u, travel_v), near)
+            part *= 1.0 - cover
+            part += shade * (BALL_GREY * self.illumination[near])
+        picture[box] = np.rint(np.minimum(region, 255.0, out=region)).astype(np.uint8)
 
     def _sphere(
-        self, ball: Array, velocity: Array, travel: float, rows: slice, columns: slice
+        self, centre: Array, velocity: Array, travel: float, box: tuple[slice, slice]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Part of each pixel that the ball covers, averaged over the exposure, and that part times its shading."""
-        steps = 1 + 2 * int(np.ceil(travel))
-        moments = ((np.arange(steps) + 0.5) / steps - 0.5) * self.exposure
-        centres = self.to_camera(ball + moments[:, None] * velocity).astype(np.float32)
-        along = np.einsum("hwc,nc->nhw", self._rays[rows, columns], centres)
-        square = np.einsum("nc,nc->n", centres, centres)[:, None, None] - along * along
-        away = np.sqrt(np.maximum(square, 0.0))
-        pixel = centres[:, 2, None, None] / self.focal
-        cover = np.clip(0.5 + (self.ball_radius - away) / pixel, 0.0, 1.0)
-        rise = np.sqrt(np.maximum(self.ball_radius**2 - square, 0.0))
-        lamp = (self.rotation @ LIGHT_DIRECTION).astype(np.float32)
-        # the surface normal's part towards the lamp: (ray * distance - centre) . lamp / radius
-        facing = (along - rise) * (self._rays[rows, columns] @ lamp) - (centres @ lamp)[:, None, None]
-        shade = cover * (0.70 + 0.30 * np.clip(facing / self.ball_radius, 0.0, 1.0))
-        return cover.mean(axis=0, dtype=np.float32), shade.mean(axis=0, dtype=np.float32)
+        """Part of each pixel that the ball covers, averaged over the exposure, and that part times its shading.
 
-    def _shadow(self, ball: Array, rows: slice, columns: slice) -> NDArray[np.float32]:
-        """Factor on the light of the table around the ball: a soft shadow away from the lamp; none off the table."""
-        height = ball[2] - self.table.top
-        foot = np.array([*(ball[:2] - LIGHT_DIRECTION[:2] / LIGHT_DIRECTION[2] * height), self.table.top])
-        over = self.table.contains(foot[0], foot[1]) and 0.0 < height < 0.2
-        if not over:
-            return np.ones((1, 1), np.float32)
-        (u, v), size = self.project(foot), self.ball_radius * self.focal / float(self.to_camera(foot)[2])
-        du = (np.arange(columns.start, columns.stop, dtype=np.float32) - u) / size
-        dv = (np.arange(rows.start, rows.stop, dtype=np.float32) - v) / size
-        gap = du[None, :] ** 2 + dv[:, None] ** 2
-        return np.asarray(1.0 - SHADOW_DEPTH * np.exp(-gap * gap / 1.5), np.float32)
+        Centre and velocity in the camera's frame; `travel`: half the ball's way in the image (px).
+        """
+        steps = 1 + 2 * math.ceil(travel)
+        moments = ((np.arange(steps) + 0.5) / steps - 0.5) * self.exposure
+        centres = (centre + moments[:, None] * velocity).astype(np.float32)
+        rays, radius = self._rays[box], np.float32(self.ball_radius)
+        shape, rays = rays.shape[:2], rays.reshape(-1, 3).T
+        along = centres @ rays
+        square = (centres * centres).sum(axis=1)[:, None] - along * along
+        np.maximum(square, 0.0, out=square)
+        cover = (radius - np.sqrt(square)) * (np.float32(self.focal) / centres[:, 2:]) + np.float32(0.5)
+        np.minimum(np.maximum(cover, 0.0, out=cover), 1.0, out=cover)
+        along -= np.sqrt(np.maximum(radius * radius - square, 0.0))  # now the distance of the ball's surface
+        # the surface normal's part towards the lamp: (ray * distance - centre) . lamp / radius
+        facing = (along * (self._lamp @ rays) - (centres @ self._lamp)[:, None]) / radius
+        np.minimum(np.maximum(facing, 0.0, out=facing), 1.0, out=facing)
+        shade = cover * (np.float32(0.70) + np.float32(0.30) * facing)
+        share = np.full(steps, 1.0 / steps, np.float32)
+        return (share @ cover).reshape(shape), (share @ shade).reshape(shape)
 
     def _box(self, u: float, v: float, reach_u: float, reach_v: float) -> tuple[slice, slice] | None:
         if not (np.isfinite(u) and np.isfinite(v)):
@@ -314,26 +326,24 @@ class PinholeCamera:
         """The hull of both ends' discs for each capsule that is in view."""
         if len(points) != len(radii):
             raise ValueError(f"{len(points)} capsules of the arm, but {len(radii)} radii")
-        depth = self.to_camera(points)[..., 2]
+        seen = self.to_camera(points)
+        depth = seen[..., 2]
+        discs = (radii[:, None] * self.focal / depth)[..., None, None] * CIRCLE
+        rims = (self._pixels(seen)[:, :, None] + discs).reshape(len(points), -1, 2)
         # at or behind the lens: out of focus anyway
-        seen = (depth > 4.0 * radii[:, None]).all(axis=1)
-        points, radii, depth = points[seen], radii[seen], depth[seen]
-        rims = self.project(points)[:, :, None] + (radii[:, None] * self.focal / depth)[..., None, None] * CIRCLE
+        sharp = (depth > 4.0 * radii[:, None]).all(axis=1)
         heights = points[..., 2].mean(axis=1)
         return [
-            self._cover(rim.reshape(-1, 2), ARM_GREY, float(height))
-            for rim, height in zip(rims, heights, strict=True)
-            if self._in_view(rim)
+            self._cover(rims[part], ARM_GREY, float(heights[part]))
+            for part in np.flatnonzero(sharp & self._in_view(rims)).tolist()
         ]
 
     def _cup_covers(self, pose: Array) -> list[_Cover]:
         """The wall as the hull of both rims, then the dark mouth as far as it faces the camera."""
-        bottom = np.array([0.0, 0.0, -self.cup_depth])
-        outer = RING * (self.cup_radius + CUP_WALL)
-        points = np.concatenate([outer, outer + bottom, RING * self.cup_radius]) @ pose[:3, :3].T + pose[:3, 3]
-        if (self.to_camera(points)[:, 2] < 0.1).any():
+        seen = self.to_camera(self._cup_rings @ pose[:3, :3].T + pose[:3, 3])
+        if seen[:, 2].min() < 0.1:
             return []
-        pixels, height = self.project(points), float(pose[2, 3])
+        pixels, height = self._pixels(seen), float(pose[2, 3])
         wall, mouth = pixels[: 2 * len(RING)], pixels[2 * len(RING) :]
         if not self._in_view(wall):
             return []
@@ -342,13 +352,15 @@ class PinholeCamera:
             covers.append(self._cover(mouth, CUP_INSIDE_GREY, height, cup=True))
         return covers
 
-    def _in_view(self, pixels: Array) -> bool:
-        low, high = pixels.reshape(-1, 2).min(axis=0), pixels.reshape(-1, 2).max(axis=0)
-        return bool(high[0] >= 0 and high[1] >= 0 and low[0] < self.width and low[1] < self.height)
+    def _in_view(self, pixels: Array) -> NDArray[np.bool_]:
+        """Whether some of the box around pixels (..., n, 2) is in the image."""
+        low, high = pixels.min(axis=-2), pixels.max(axis=-2)
+        inside: NDArray[np.bool_] = ((high >= 0.0) & (low < (self.width, self.height))).all(axis=-1)
+        return inside
 
     def _cover(self, pixels: Array, grey: float, height: float, cup: bool = False) -> _Cover:
         """The convex hull of pixels in its middle's light."""
-        u, v = pixels.mean(axis=0)
+        u, v = (pixels.sum(axis=0) / len(pixels)).tolist()
         light = self.illumination[min(max(int(v), 0), self.height - 1), min(max(int(u), 0), self.width - 1)]
         hull = np.asarray(cv2.convexHull(np.rint(pixels * 16).astype(np.int32)), np.int32)
         return _Cover(hull, grey * float(light), height, cup)
@@ -360,6 +372,15 @@ class PinholeCamera:
     def _inside_cup(self, ball: Array, pose: Array) -> bool:
         local = (ball - pose[:3, 3]) @ pose[:3, :3]
         return bool(np.hypot(local[0], local[1]) < self.cup_radius and -self.cup_depth < local[2] < self.ball_radius)
+
+
+def _shadow(u: float, v: float, size: float, box: tuple[slice, slice]) -> NDArray[np.float32]:
+    """Factor on the light of the table around the ball: soft, the ball's `size` (px) wide, about the pixel (u, v)."""
+    rows, columns = box
+    du = (np.arange(columns.start, columns.stop, dtype=np.float32) - u) / size
+    dv = (np.arange(rows.start, rows.stop, dtype=np.float32) - v) / size
+    gap = (du * du)[None, :] + (dv * dv)[:, None]
+    return np.asarray(1.0 - SHADOW_DEPTH * np.exp(gap * gap / -1.5), np.float32)
 
 
 def _looking_down(camera: Mapping[str, Any]) -> Array:

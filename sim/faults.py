@@ -17,11 +17,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
+from services.comm.canbus import Frame
 
 LASTING = ("drop_images", "dead_camera", "can_errors", "bus_off", "arm_power")
 KEYS: Mapping[str, tuple[str, ...]] = {
@@ -102,6 +104,11 @@ class FaultPlan:
             self._lasting = [f for f in self._lasting if f.end > now]
         return begun
 
+    @property
+    def none(self) -> bool:
+        """Whether no fault is planned and none lasts."""
+        return not (self._coming or self._lasting)
+
     def active(self, kind: str) -> bool:
         """Whether a lasting fault of this kind goes on."""
         return any(fault.kind == kind for fault in self._lasting)
@@ -113,6 +120,10 @@ class FaultPlan:
     def frame_lost(self) -> bool:
         """Whether the frame sent now is lost."""
         return bool(self._lasting) and (self.active("bus_off") or self._lost("can_errors"))
+
+    def passed(self, frames: Sequence[Frame]) -> Sequence[Frame]:
+        """The frames sent now that are not lost."""
+        return [frame for frame in frames if not self.frame_lost()] if self._lasting else frames
 
     def _lost(self, kind: str) -> bool:
         shares = [fault.value for fault in self._lasting if fault.kind == kind]

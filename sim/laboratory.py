@@ -63,6 +63,7 @@ class Laboratory:
         cup = site.cell["cup"]
         load = self._mount.load(truth.settings["cup"]["mass"], cup["radius"], cup["depth"])
         self.plant = ArmPlant(site.arm, site.cell["ball"]["gravity"], site.arm.poses["home"].tolist(), load=load)
+        self._home: list[float] = site.arm.poses["home"].tolist()
         self.bus = DriveBus(self.plant, site.drives)
         self.exposures = Exposures()
         self._camera_at: dict[str, str] = {}
@@ -131,13 +132,13 @@ class Laboratory:
         """Frames of the endpoint `port`, which from now on gets the bus's."""
         if port not in self._bus_ports:
             self._bus_ports.append(port)
-        for frame in frames:
-            if not self._faults.frame_lost():
-                self.bus.receive(now, frame)
+        receive = self.bus.receive
+        for frame in self._faults.passed(frames):
+            receive(now, frame)
 
-    def take_frames(self) -> list[Frame]:
+    def take_frames(self) -> Sequence[Frame]:
         """Frames of drives and inputs since the last call."""
-        return [frame for frame in self.bus.drain() if not self._faults.frame_lost()]
+        return self._faults.passed(self.bus.drain())
 
     def _send_frames(self) -> None:
         if not self._bus_ports:
@@ -198,15 +199,10 @@ class Laboratory:
         if self.exposures.rate <= 0.0 or self.world.ball is not None or self.world.barrier:
             return False
         rules = self.truth.settings["thrower"]
-        home = self._home
-        return all(abs(speed) < rules["still_speed"] for speed in self.plant.qd) and all(
-            abs(angle - at) < rules["home_tolerance"] for angle, at in zip(self.plant.q, home, strict=True)
-        )
-
-    @property
-    def _home(self) -> list[float]:
-        home: list[float] = self._site.arm.poses["home"].tolist()
-        return home
+        still, near = rules["still_speed"], rules["home_tolerance"]
+        if max(self.plant.qd) >= still or min(self.plant.qd) <= -still:
+            return False
+        return all(-near < angle - at < near for angle, at in zip(self.plant.q, self._home, strict=True))
 
     def _move(self, now: float) -> None:
         """The world goes on by a tick, the arm in steps of 1 ms, the ball as finely as it needs."""
@@ -244,6 +240,8 @@ class Laboratory:
     # Faults and services
 
     def _begin_faults(self, now: float) -> None:
+        if self._faults.none:
+            return
         powerless = self._faults.active("arm_power")
         for fault in self._faults.begin(now):
             self._strike(fault)

@@ -77,6 +77,8 @@ class World:
         self._start_at = 0.0
         self._start: BallState | None = None
         self._motion: TableMotion | None = None
+        self._leaves = (math.inf, 0)
+        """Seconds after `_start_at` when the ball rolls over an edge, and 0 if that is the near one."""
         self._still_since: float | None = None
 
     # What the laboratory asks
@@ -195,7 +197,14 @@ class World:
 
     def _roll(self, now: float, start: BallState) -> None:
         resistance = self.course.throw.rolling_resistance if self.course else 0.0
-        self._motion = TableMotion(self.model, start, resistance)
+        self._motion = motion = TableMotion(self.model, start, resistance)
+        table = self._truth.table
+        self._leaves = min(
+            (motion.first_crossing(0, table.near_edge), 0),
+            (motion.first_crossing(0, table.far_edge), 1),
+            (motion.first_crossing(1, table.half_width), 1),
+            (motion.first_crossing(1, -table.half_width), 1),
+        )
         self._start_at, self._look_at, self.where = now, -math.inf, Where.TABLE
 
     def _soar(self, now: float, start: BallState) -> None:
@@ -221,14 +230,7 @@ class World:
         motion = self._motion
         if motion is None:
             return
-        table = self._truth.table
-        crossings = [
-            (motion.first_crossing(0, table.near_edge), 0),
-            (motion.first_crossing(0, table.far_edge), 1),
-            (motion.first_crossing(1, table.half_width), 1),
-            (motion.first_crossing(1, -table.half_width), 1),
-        ]
-        leaves, edge = min(crossings)
+        leaves, edge = self._leaves
         elapsed = now - self._start_at
         if elapsed < leaves:
             self.ball = motion.state(elapsed)
