@@ -183,14 +183,13 @@ class CanopenNode:
         self.outbox: list[Frame] = []
         self._latched: bytes | None = None
         self._applied: bytes | None = None
-        self._shown: list[int] = []
-        self._frame: Frame | None = None
+        self._tpdo_frame: Frame | None = None
         self._beat_due = 0.0
         self._master_due: float | None = None
 
     # What a device adds.
     def before_sending(self) -> None:
-        """Bring the objects that a TPDO may carry up to date."""
+        """Bring the objects that a TPDO may carry up to date; call `changed` if one of them is another than before."""
 
     def before_reading(self) -> None:
         """Bring all objects that change by themselves up to date."""
@@ -222,7 +221,8 @@ class CanopenNode:
         self.tpdo.refresh()
         self.after_configuring()
         self._latched, self._master_due, self._beat_due = None, None, now
-        self._frame = self._applied = None
+        self._applied = None
+        self.changed()
         self.outbox.append(heartbeat(self.node, NmtState.BOOT_UP))
         self.nmt = NmtState.PREOPERATIONAL
         self.on_nmt(now, NmtState.BOOT_UP)
@@ -271,12 +271,16 @@ class CanopenNode:
         """Send the TPDO now, if it is on and the node operational."""
         if self.nmt is NmtState.OPERATIONAL and self.tpdo.on:
             self.before_sending()
-            values = self.values
-            content = [values[key] for key in self.tpdo.keys]
-            if self._frame is None or content != self._shown:
-                self._shown = content
-                self._frame = Frame(self.tpdo.cob_id, self.tpdo.layout.pack(*content))
-            self.outbox.append(self._frame)
+            frame = self._tpdo_frame
+            if frame is None:
+                values = self.values
+                data = self.tpdo.layout.pack(*[values[key] for key in self.tpdo.keys])
+                self._tpdo_frame = frame = Frame(self.tpdo.cob_id, data)
+            self.outbox.append(frame)
+
+    def changed(self) -> None:
+        """What a TPDO may carry is another than before."""
+        self._tpdo_frame = None
 
     def take_rpdo(self, now: float, data: bytes) -> None:
         """Keep the data of an RPDO until SYNC, or obey at once if it is not synchronous."""
@@ -355,9 +359,9 @@ class CanopenNode:
         self.check_write(index, sub, value)
         self.values[index, sub] = value
         self._applied = None
+        self.changed()
         if pdo is not None and (sub == 0 or index == pdo.parameters):
             pdo.refresh()
-            self._frame = None
         if (index, sub) == (0x1016, 1):
             self._master_due = None  # watched from the next heartbeat on
         self.after_configuring()

@@ -28,7 +28,9 @@ class DigitalInputs(CanopenNode):
 
     def before_sending(self) -> None:
         """Show the inputs."""
-        self.values[0x6000, 1] = self.inputs
+        if self.values[0x6000, 1] != self.inputs:
+            self.values[0x6000, 1] = self.inputs
+            self.changed()
 
     def due(self) -> float:
         """At once while a change is still to be sent."""

@@ -39,12 +39,12 @@ _REGISTERS: Final = {
 }  # fmt: skip
 _POWERLESS: Final = (Fault.OVERCURRENT, Fault.UNDERVOLTAGE, Fault.ENCODER)
 """Faults after which a drive cannot brake by its motor: the brake takes over at once."""
-_STATUSWORD, _CONTROLWORD = (Object.STATUSWORD, 0), (Object.CONTROLWORD, 0)
+_STATUSWORD, _CONTROLWORD = (int(Object.STATUSWORD), 0), (int(Object.CONTROLWORD), 0)
 _POSITION, _VELOCITY, _TORQUE, _TARGET = (
-    (Object.POSITION, 0),
-    (Object.VELOCITY, 0),
-    (Object.TORQUE, 0),
-    (Object.TARGET_POSITION, 0),
+    (int(Object.POSITION), 0),
+    (int(Object.VELOCITY), 0),
+    (int(Object.TORQUE), 0),
+    (int(Object.TARGET_POSITION), 0),
 )
 _POWERED: Final = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
 _DOWN: Final = (State.FAULT, State.FAULT_REACTION_ACTIVE)
@@ -95,7 +95,7 @@ class Drive(CanopenNode):
         self.joint = joint
         self.plant = plant
         self._stir = stir
-        self._measured: tuple[float, float, float] | None = None
+        self._shown: tuple[int, float, float, float] | None = None
         self.servo = JointServo(rating, plant.q[joint])
         self.state = State.NOT_READY_TO_SWITCH_ON
         self.powered = True
@@ -116,19 +116,22 @@ class Drive(CanopenNode):
         elif before is NmtState.OPERATIONAL and self.state is State.OPERATION_ENABLED:
             self._quick_stop(State.QUICK_STOP_ACTIVE)
         self._synced = now
-        self._measured = None
+        self._shown = None
         self._refresh()
 
     def before_sending(self) -> None:
         """Bring status, position, speed and torque up to date."""
-        values, plant, joint = self.values, self.plant, self.joint
-        values[_STATUSWORD] = self.statusword()
-        measured = plant.q[joint], plant.qd[joint], self._torque
-        if measured != self._measured:
-            self._measured = measured
-            values[_POSITION] = round(measured[0] * UNITS)
-            values[_VELOCITY] = round(measured[1] * UNITS)
-            values[_TORQUE] = round(1000.0 * self._torque / self.servo.rating.torque)
+        plant, joint = self.plant, self.joint
+        shown = word, q, qd, torque = self.statusword(), plant.q[joint], plant.qd[joint], self._torque
+        if shown == self._shown:
+            return
+        self._shown = shown
+        values = self.values
+        values[_STATUSWORD] = word
+        values[_POSITION] = round(q * UNITS)
+        values[_VELOCITY] = round(qd * UNITS)
+        values[_TORQUE] = round(1000.0 * torque / self.servo.rating.torque)
+        self.changed()
 
     def before_reading(self) -> None:
         """Bring what only an SDO reads up to date as well."""

@@ -93,18 +93,18 @@ class ArmModel:
 
     def _chain(self, q: Sequence[float], frames: list[Frame3] | None) -> Frame3:
         """Frame 6, and all on the way to it appended to `frames` if one asks for them. Plain floats: 8 us a pose."""
-        X, Y, Z, o = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), self.base
+        xx, xy, xz, yx, yy, yz, zx, zy, zz = 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0
+        ox, oy, oz = self.base
         for angle, d, a, (ca, sa) in zip(q, self.d, self.a, self.twists, strict=True):
             c, s = math.cos(angle), math.sin(angle)
-            x = c * X[0] + s * Y[0], c * X[1] + s * Y[1], c * X[2] + s * Y[2]
-            n = c * Y[0] - s * X[0], c * Y[1] - s * X[1], c * Y[2] - s * X[2]
-            o = o[0] + d * Z[0] + a * x[0], o[1] + d * Z[1] + a * x[1], o[2] + d * Z[2] + a * x[2]
-            y = ca * n[0] + sa * Z[0], ca * n[1] + sa * Z[1], ca * n[2] + sa * Z[2]
-            Z = ca * Z[0] - sa * n[0], ca * Z[1] - sa * n[1], ca * Z[2] - sa * n[2]
-            X, Y = x, y
+            nx, ny, nz = c * yx - s * xx, c * yy - s * xy, c * yz - s * xz
+            xx, xy, xz = c * xx + s * yx, c * xy + s * yy, c * xz + s * yz
+            ox, oy, oz = ox + d * zx + a * xx, oy + d * zy + a * xy, oz + d * zz + a * xz
+            yx, yy, yz = ca * nx + sa * zx, ca * ny + sa * zy, ca * nz + sa * zz
+            zx, zy, zz = ca * zx - sa * nx, ca * zy - sa * ny, ca * zz - sa * nz
             if frames is not None:
-                frames.append(Frame3(X, Y, Z, o))
-        return Frame3(X, Y, Z, o)
+                frames.append(Frame3((xx, xy, xz), (yx, yy, yz), (zx, zy, zz), (ox, oy, oz)))
+        return Frame3((xx, xy, xz), (yx, yy, yz), (zx, zy, zz), (ox, oy, oz))
 
     def flange_frame(self, q: Sequence[float]) -> Frame3:
         """Frame 6 at joint angles `q` (six, rad)."""
