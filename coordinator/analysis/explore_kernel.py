@@ -78,42 +78,17 @@ def enabled_into(
 
 
 @jit
-def slot_of(key: Words, factors: Words, mask: int) -> np.int64:
-    """The first slot that a key may stand in."""
-    hashed = np.uint64(0)
-    for w in range(len(key)):
-        hashed += key[w] * factors[w]
-        hashed ^= hashed >> np.uint64(32)
-    return np.int64((hashed * factors[len(key)] >> np.uint64(20)) & np.uint64(mask))
-
-
-@jit
-def find_or_add(keys: Words, states: int, table: NDArray[np.int32], factors: Words) -> int:
-    """The number of the key that stands in row `states`; that number itself if it is new, and then it is entered."""
-    mask = len(table) - 1
-    slot = slot_of(keys[states], factors, mask)
-    while table[slot] >= 0:
-        number = np.int64(table[slot])
-        same = True
-        for w in range(keys.shape[1]):
-            if keys[number, w] != keys[states, w]:
-                same = False
-                break
-        if same:
-            return int(number)
-        slot = (slot + 1) & mask
-    table[slot] = states
-    return states
-
-
-@jit
 def enter_all(keys: Words, states: int, table: NDArray[np.int32], factors: Words) -> None:
     """Enter the first `states` keys, all different, in an empty table."""
-    mask = len(table) - 1
+    mask, words = np.uint64(len(table) - 1), keys.shape[1]
     for number in range(states):
-        slot = slot_of(keys[number], factors, mask)
+        hashed = np.uint64(0)
+        for w in range(words):
+            hashed = hashed + keys[number, w] * factors[w]
+            hashed = hashed ^ (hashed >> np.uint64(32))
+        slot = np.int64((hashed * factors[words] >> np.uint64(20)) & mask)
         while table[slot] >= 0:
-            slot = (slot + 1) & mask
+            slot = (slot + 1) & np.int64(mask)
         table[slot] = number
 
 
@@ -140,6 +115,7 @@ def expand_block(
     out = np.empty(len(able) + 1, dtype=np.int64)
     begin, edges, room = expanded, 0, len(target) - len(able)
     most = min(len(keys) - 1, len(table) // 2) - len(able)
+    mask, words = np.uint64(len(table) - 1), keys.shape[1]
     while expanded < stop:
         if states >= cap:
             return CAPPED, expanded, states, edges
@@ -148,17 +124,31 @@ def expand_block(
         count = enabled_into(keys[expanded], able, priority, first, word, sub, guard, want, guards, out)
         before = states
         for j in range(count):
-            t = out[j]
-            spilt = np.uint64(0)
-            for w in range(keys.shape[1]):
-                keys[states, w] = keys[expanded, w] + delta[t, w]
-                spilt |= keys[states, w] & guards[w]
+            t, spilt, hashed = out[j], np.uint64(0), np.uint64(0)
+            for w in range(words):
+                key = keys[expanded, w] + delta[t, w]
+                keys[states, w] = key
+                spilt |= key & guards[w]
+                hashed = hashed + key * factors[w]
+                hashed = hashed ^ (hashed >> np.uint64(32))
             if spilt != 0:
-                for w in range(keys.shape[1]):
+                for w in range(words):
                     keys[before, w] = keys[states, w]
                 return OVERFLOWN, expanded, before, edges
-            number = find_or_add(keys, states, table, factors)
-            if number == states:
+            # Found or added here and not by a helper: a compiled call would count references of its arrays each time.
+            slot = np.int64((hashed * factors[words] >> np.uint64(20)) & mask)
+            number = np.int64(table[slot])
+            while number >= 0:
+                w = 0
+                while w < words and keys[number, w] == keys[states, w]:
+                    w += 1
+                if w == words:
+                    break
+                slot = (slot + 1) & np.int64(mask)
+                number = np.int64(table[slot])
+            if number < 0:
+                number = np.int64(states)
+                table[slot] = states
                 states += 1
             target[edges + j] = number
             label[edges + j] = t

@@ -7,9 +7,10 @@ is passed in; the same generator gives the same result.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import sqrt
 from statistics import NormalDist
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,8 +143,12 @@ def simulate(
     firings: int = 10_000_000,
     confidence: float = 0.95,
     progress: Callable[[int, float], None] | None = None,
+    engine: Literal["numpy", "numba"] = "numpy",
 ) -> Simulation:
     """Play replicas from the initial marking until `horizon` (s) or their goal, at most `firings` in total.
+
+    The engine "numba" (an extra) needs a horizon and knows no goal; its draws come in another order, so its numbers differ
+    from those of "numpy" within their intervals. Raises ImportError where it is not installed.
 
     Throughput and mean tokens are taken from `warmup` (s) on. Without a horizon a goal is needed, and replicas that are
     dead before it count as not completed. `progress` is called with (firings, share of replicas still played).
@@ -151,6 +156,8 @@ def simulate(
     """
     if goal is None and not horizon < np.inf:
         raise ValueError("a simulation needs a horizon (s) or a goal")
+    if engine == "numba":
+        return _compiled(gspn, random, replicas, horizon, warmup, goal, firings, confidence, progress)
     play = _Play(gspn, random, replicas, horizon, warmup, goal)
     try:
         while len(play.alive) and play.fired < firings:
@@ -160,6 +167,71 @@ def simulate(
     except KeyboardInterrupt:
         play.interrupted = True
     return play.result(confidence)
+
+
+def _compiled(
+    gspn: Gspn,
+    random: np.random.Generator,
+    replicas: int,
+    horizon: float,
+    warmup: float,
+    goal: Stop | None,
+    firings: int,
+    confidence: float,
+    progress: Callable[[int, float], None] | None,
+) -> Simulation:
+    """Replicas one after the other by the compiled kernel."""
+    from coordinator.analysis.compiled import COMPILED
+    from coordinator.analysis.simulate_kernel import Tables, play
+
+    if not COMPILED:
+        raise ImportError("the engine 'numba' needs numba: install petrobot[numba], or take the engine 'numpy'")
+    if goal is not None or not horizon < np.inf:
+        raise ValueError("the engine 'numba' plays to a horizon; take the engine 'numpy' for a goal")
+    tables, initial = Tables.of(gspn), np.array(gspn.net.initial, dtype=np.int64)
+    fires = np.zeros((replicas, len(gspn.net.transitions)))
+    area = np.zeros((replicas, len(gspn.net.places)))
+    observed = np.zeros(replicas)
+    done = fired = 0
+    try:
+        while done < replicas and fired < firings:
+            more, observed[done] = play(
+                initial, tables, random, horizon, warmup, firings - fired, fires[done], area[done]
+            )
+            fired, done = fired + more, done + 1
+            if progress and done % 100 == 0:
+                progress(fired, 1 - done / replicas)
+    except KeyboardInterrupt:
+        pass
+    seen = observed > 0
+    complete = done == replicas and fired < firings
+    return _summed(gspn, fires[seen].T, area[seen].T, observed[seen], fired, replicas, complete, confidence)
+
+
+def _summed(
+    gspn: Gspn,
+    fires: Values,
+    area: Values,
+    observed: Values,
+    fired: int,
+    replicas: int,
+    complete: bool,
+    confidence: float,
+) -> Simulation:
+    """Estimates from counts of shape (transitions, n), areas (places, n) and observed times (n,)."""
+    net = gspn.net
+    rates = fires / observed if len(observed) else np.full((len(net.transitions), 1), np.nan)
+    tokens = area / observed if len(observed) else np.full((len(net.places), 1), np.nan)
+    return Simulation(
+        replicas,
+        fired,
+        {name: Estimate.of(row, confidence) for name, row in zip(net.transitions, rates, strict=True)},
+        {name: Estimate.of(row, confidence) for name, row in zip(net.places, tokens, strict=True)},
+        None,
+        None,
+        np.zeros(0),
+        complete,
+    )
 
 
 class _Play:
@@ -224,22 +296,17 @@ class _Play:
 
     def result(self, confidence: float) -> Simulation:
         """Everything seen so far, as estimates."""
-        net = self.state.net
         seen = self.observed > 0
-        per_time = self.observed[seen] if seen.any() else np.ones(1)
-        rates = self.fires[:, seen] / per_time if seen.any() else np.full((len(net.transitions), 1), np.nan)
-        tokens = self.area[:, seen] / per_time if seen.any() else np.full((len(net.places), 1), np.nan)
+        complete = not len(self.alive) and not self.interrupted
+        fires, area = self.fires[:, seen], self.area[:, seen]
+        bare = _summed(self.state.gspn, fires, area, self.observed[seen], self.fired, self.count, complete, confidence)
         times = np.sort(self.reached[~np.isnan(self.reached)])
         judged = self.count - len(self.alive)
-        return Simulation(
-            self.count,
-            self.fired,
-            {name: Estimate.of(row, confidence) for name, row in zip(net.transitions, rates, strict=True)},
-            {name: Estimate.of(row, confidence) for name, row in zip(net.places, tokens, strict=True)},
-            Estimate.share(len(times), judged, confidence) if self.goal is not None and judged else None,
-            Estimate.of(times, confidence) if len(times) else None,
-            times,
-            not len(self.alive) and not self.interrupted,
+        return replace(
+            bare,
+            completed=Estimate.share(len(times), judged, confidence) if self.goal is not None and judged else None,
+            time=Estimate.of(times, confidence) if len(times) else None,
+            times=times,
         )
 
 

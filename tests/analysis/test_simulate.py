@@ -8,11 +8,13 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.stats import gamma
 
+from coordinator.analysis.compiled import COMPILED
 from coordinator.analysis.completion import completion, law
 from coordinator.analysis.gspn import Chain, Gspn
 from coordinator.analysis.markov import long_run, transient
 from coordinator.analysis.phase_type import fit, fit_samples, gamma_quantile
 from coordinator.analysis.simulate import Estimate, goal_by_marking, simulate, token_game
+from coordinator.analysis.simulate_kernel import Tables, play
 from coordinator.net import Net
 from tests.analysis.generators import KANBAN_RATES, kanban, queue, stages
 from tests.analysis.random_nets import gspns
@@ -134,3 +136,34 @@ def test_estimates() -> None:
         1.0
     )
     assert Estimate.of(np.array([1.0]), 0.95).covers(1e9)
+
+
+@settings(max_examples=15, deadline=None)
+@given(gspns(), st.integers(0, 2**32))
+def test_the_compiled_loop_plays_the_same_net(gspn: Gspn, seed: int) -> None:
+    """The kernel as it stands (compiled where numba is installed) against the replicas of numpy, within wide intervals."""
+    random = np.random.default_rng(seed)
+    tables, initial = Tables.of(gspn), np.array(gspn.net.initial)
+    runs, horizon, warmup = 120, 3.0, 0.5
+    fires = np.zeros((runs, len(gspn.net.transitions)))
+    area = np.zeros((runs, len(gspn.net.places)))
+    for i in range(runs):
+        _, seen = play(initial, tables, random, horizon, warmup, 10_000, fires[i], area[i])
+        assert seen == pytest.approx(horizon - warmup)
+        assert area[i].sum() == pytest.approx(sum(gspn.net.initial) * seen)
+    other = simulate(gspn, random, replicas=600, horizon=horizon, warmup=warmup, confidence=1 - 1e-9)
+    for t, name in enumerate(gspn.net.transitions):
+        ours = Estimate.of(fires[:, t] / (horizon - warmup), 1 - 1e-9)
+        assert ours.low - 0.1 <= other.throughput[name].high and other.throughput[name].low <= ours.high + 0.1
+
+
+def test_the_compiled_engine_is_an_extra() -> None:
+    gspn = Gspn.of(queue(5), {"arrive": 0.8, "serve": 1.0})
+    if not COMPILED:
+        with pytest.raises(ImportError, match=r"petrobot\[numba\]"):
+            simulate(gspn, sure(10), horizon=10.0, engine="numba")
+        return
+    seen = simulate(gspn, sure(10), replicas=300, horizon=300.0, warmup=30.0, engine="numba", confidence=0.9999)
+    assert seen.throughput["serve"].covers(0.7289444010755486) and seen.complete
+    with pytest.raises(ValueError, match="for a goal"):
+        simulate(gspn, sure(10), goal=lambda tokens: tokens[0] > 1, horizon=1.0, engine="numba")
