@@ -198,6 +198,10 @@ class PinholeCamera:
 
     # Images
 
+    def warm_up(self) -> None:
+        """Make all that is made once: in real time the first image must not take longer than the others."""
+        _ = self.background, self._rays
+
     def render(
         self,
         ball: ArrayLike | None,

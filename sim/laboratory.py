@@ -158,7 +158,7 @@ class Laboratory:
 
     def draw_scene(self, regime: str) -> None:
         """Draw the still scene of a regime's camera ahead of its first image. Raises LaboratoryError."""
-        _ = camera_of(self._site.cell, self._site.truth(regime), self._noise).background
+        camera_of(self._site.cell, self._site.truth(regime), self._noise).warm_up()
 
     def camera(self) -> PinholeCamera:
         """The camera as it hangs in this regime, ready for the next image."""
