@@ -15,10 +15,13 @@ import asyncio
 import contextlib
 import gc
 import os
+import queue
 import secrets
 import signal
 import threading
 import time
+from collections.abc import Callable
+from concurrent.futures import Future
 from typing import Final
 
 from services.comm.callee import Callee, Offer, Order, StartRun
@@ -54,6 +57,7 @@ class Pacemaker:
         self._port = hub.port() if hub else None
         self._images = images
         self._generation = 0
+        self._jobs: queue.SimpleQueue[tuple[Callable[[], Outcome], Future[Outcome]]] = queue.SimpleQueue()
         self._stopped = threading.Event()
         self._begin = 0.0
 
@@ -76,6 +80,22 @@ class Pacemaker:
                 self._laboratory.tick(self._laboratory.now)
                 self._send_frames()
             self._serve_camera()
+            self._do_jobs()
+
+    def submit(self, job: Callable[[], Outcome]) -> Future[Outcome]:
+        """Have something done between two ticks, in the pacemaker's own thread: in another it could keep the world waiting."""
+        done: Future[Outcome] = Future()
+        self._jobs.put((job, done))
+        return done
+
+    def _do_jobs(self) -> None:
+        while not self._jobs.empty():
+            job, done = self._jobs.get_nowait()
+            try:
+                with self.lock:
+                    done.set_result(job())
+            except Exception as fault:
+                done.set_exception(fault)
 
     def _wait(self, deadline: float) -> None:
         """Until the deadline, answering what comes from the bus."""
@@ -188,7 +208,7 @@ class LaboratoryShell:
         """A regime in which the camera hangs elsewhere needs seconds to draw its still scene: not in the loop, not in a tick."""
         with contextlib.suppress(LaboratoryError):  # the answer says what is wrong with the regime
             await asyncio.to_thread(self.laboratory.draw_scene, str(call.arguments.get("regime", "A")))
-        outcome = self._answer(self.server.now(), call)
+        outcome = await asyncio.wrap_future(self.pacemaker.submit(lambda: self.laboratory.answer(call)))
         self.server.callee.finish(
             self.server.now(), call.id, outcome.status, outcome.values, outcome.cause, outcome.text, outcome.executed
         )
