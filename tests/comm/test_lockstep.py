@@ -296,9 +296,9 @@ def test_a_failing_party_is_named_to_the_others() -> None:
 def test_a_member_that_never_comes_is_named() -> None:
     listeners, addresses = _listeners(["a", "b"])
     with pytest.raises(PartyLostError, match=r"b: it did not join the cell in 0\.1 s"):
-        Member("a", [Post("a")], addresses, listener=listeners["a"], patience=0.1).open()
+        Member("a", [Post("a")], addresses, listener=listeners["a"], joining=0.1).open()
     with pytest.raises(PartyLostError, match="a: nobody answers on 127"):
-        Member("b", [Post("b")], addresses, listener=listeners["b"], patience=0.1).open()
+        Member("b", [Post("b")], addresses, listener=listeners["b"], joining=0.1).open()
 
 
 def _join(address: tuple[str, int], name: str = "b", directory: str = "") -> socket.socket:
@@ -395,7 +395,7 @@ def test_members_with_different_directories_do_not_form_a_cell() -> None:
     listeners, addresses = _listeners(["a", "b"])
 
     def member(name: str, directory: str) -> Callable[[], None]:
-        return Member(name, [Post(name)], addresses, listener=listeners[name], directory=directory, patience=0.5).open
+        return Member(name, [Post(name)], addresses, listener=listeners[name], directory=directory, joining=0.5).open
 
     a, b = _in_threads([member("a", "d1"), member("b", "d2")])
     assert isinstance(b, CellError) and "different services.toml" in str(b)
