@@ -334,7 +334,11 @@ class Arm:
         """How far (rad) the measured joints are off the path commanded of late; how late they are on it does not count."""
         if self._mode == "off" or not self._commanded:
             return 0.0
-        return min(map(self._off_by, self._commanded))
+        least, before = math.inf, None
+        for q in self._commanded:
+            if q is not before:  # the same one cycle after cycle while the arm stands
+                least, before = min(least, self._off_by(q)), q
+        return least
 
     def _lost(self) -> bool:
         """Whether the measured joints are too far off all of that path; most often the first look settles it."""

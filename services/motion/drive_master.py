@@ -38,6 +38,7 @@ HEARTBEAT_MS: Final = 50
 """Period of everybody's heartbeat."""
 HEARTBEAT_PATIENCE_MS: Final = 200
 """Silence after which a node counts as lost (both ways)."""
+HEARTBEAT_PATIENCE: Final = HEARTBEAT_PATIENCE_MS / 1e3
 SILENT_CYCLES: Final = 10
 """Cycles without a drive's TPDO after which it counts as lost."""
 RETRY: Final = 1.0
@@ -108,6 +109,8 @@ class DriveLink:
         self.error_code = 0
         self.controlword = 0
         self._asked = 0.2 * node  # not all at once
+        self._reading = False
+        self._rpdo = canopen.RPDO1_BASE + node
         self._wait = 0
         self._stopping = 0
 
@@ -151,12 +154,14 @@ class DriveLink:
 
     def ask_speed(self, now: float, hurry: bool) -> list[Frame]:
         """Read the drive's greatest speed again when it is time, sooner in a hurry: drives may slow down by themselves."""
-        if self.sdo.busy:
-            return self.sdo.advance(now)
-        self.max_speed = from_units(self.sdo.results.get((Object.MAX_SPEED, 0), to_units(self.max_speed)))
+        if self._reading:
+            if self.sdo.busy:
+                return self.sdo.advance(now)
+            self._reading = False
+            self.max_speed = from_units(self.sdo.results.get((Object.MAX_SPEED, 0), to_units(self.max_speed)))
         if now - self._asked < (LIMITED_POLL if hurry else SPEED_POLL):
             return []
-        self._asked = now
+        self._asked, self._reading = now, True
         self.sdo.begin([Transfer(Object.MAX_SPEED, 0, _U32)])
         return self.sdo.advance(now)
 
@@ -164,27 +169,34 @@ class DriveLink:
         """The drive's TPDO. Raises ValueError for bytes that are none."""
         if len(data) != _TPDO.size:
             raise ValueError(f"TPDO of node {self.node} has {len(data)} bytes, must have {_TPDO.size}")
-        self.statusword, position, torque = _TPDO.unpack(data)
-        self.state = state_of(self.statusword)
+        statusword, position, torque = _TPDO.unpack(data)
+        if statusword != self.statusword or not self.spoken:
+            self.state, self.statusword = state_of(statusword), statusword
         self.position, self.torque = from_units(position), torque / 1e3
         self.silent, self.spoken = 0, True
 
     def frame(self, target: float, wanted: bool, resetting: bool) -> Frame:
         """The RPDO: a controlword that leads to where the master wants the drive, and the target position (rad)."""
         self._stopping = 0 if wanted else self._stopping + 1
+        if wanted and self.state is State.OPERATION_ENABLED:
+            self.controlword = _GO_ON
+        else:
+            self.controlword = self._command(wanted, resetting).word
+        return Frame(self._rpdo, _RPDO.pack(self.controlword, to_units(target)))
+
+    def _command(self, wanted: bool, resetting: bool) -> Command:
         if not wanted:
             brakes = self.state in _MOVING and self._stopping <= STOP_CYCLES
-            command = Command.QUICK_STOP if brakes else Command.DISABLE_VOLTAGE
-        elif self.state is State.FAULT:
+            return Command.QUICK_STOP if brakes else Command.DISABLE_VOLTAGE
+        if self.state is State.FAULT:
             self._wait = (self._wait + 1) % RESET_CYCLES
-            command = Command.FAULT_RESET if resetting and self._wait == 1 else Command.DISABLE_VOLTAGE
-        else:
-            command = ENABLING.get(self.state, Command.DISABLE_VOLTAGE)
-        self.controlword = command.word
-        return Frame(canopen.RPDO1_BASE + self.node, _RPDO.pack(command.word, to_units(target)))
+            return Command.FAULT_RESET if resetting and self._wait == 1 else Command.DISABLE_VOLTAGE
+        return ENABLING.get(self.state, Command.DISABLE_VOLTAGE)
 
 
 _MOVING: Final = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE)
+_GO_ON: Final = ENABLING[State.OPERATION_ENABLED].word
+"""Controlword to a drive that follows its set points."""
 
 
 class DriveMaster:
@@ -284,7 +296,9 @@ class DriveMaster:
             frames.append(canopen.SYNC)
             hurry = self.limited
             for drive in self.drives:
-                frames += drive.ask_speed(now, hurry)
+                asked = drive.ask_speed(now, hurry)
+                if asked:
+                    frames += asked
         return frames
 
     def _configure(self, now: float) -> list[Frame]:
@@ -339,11 +353,11 @@ class DriveMaster:
             if drive.state is State.FAULT and not self._resetting and drive.spoken and drive.silent <= 1:
                 self._fault(drive, drive.error_code)
         for node, heard in self._heard.items():
-            if now - heard > HEARTBEAT_PATIENCE_MS / 1e3:
+            if now - heard > HEARTBEAT_PATIENCE:
                 self._report(Trouble("bus", None, 0, f"node {node} sends no heartbeat"))
         if self.phase is Phase.STARTING and all(drive.spoken for drive in self.drives):
             self.phase = Phase.RUNNING
-        if self.enabled:
+        if self._resetting and self.enabled:
             self._resetting = False
 
     def _beat(self, now: float, frame: Frame) -> None:

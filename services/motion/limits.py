@@ -50,7 +50,8 @@ class Guard:
         self._model = model
         self._body = model.body
         self._cell = cell
-        self._limits = list(zip(model.lower.tolist(), model.upper.tolist(), strict=True))
+        lowest, highest = model.lower - JOINT_SLACK, model.upper + JOINT_SLACK
+        self._limits = list(zip(lowest.tolist(), highest.tolist(), strict=True))
         self._length = cell.cup.depth + cell.cup.wall
         self._radius = cell.cup.radius + cell.cup.wall
         mouth, axis = cell.cup.mouth, cell.cup.axis
@@ -59,6 +60,11 @@ class Guard:
         )
         self._swing = max(ends) + self._radius
         """m from the wrist's centre within which the whole cup is."""
+        self._thickest = max(self._body.forearm, self._body.wrist)
+        self._before_table = cell.near_edge - arm_margin
+        self._above_table = cell.table_top + arm_margin
+        self._above_pedestal = max(puma.d1 + self._body.base, self._above_table, arm_margin)
+        self._beside_pedestal = self._body.base + self._body.wrist + arm_margin
 
     def closer(self, share: float) -> Guard:
         """A guard that keeps only a share of the margins."""
@@ -66,7 +72,9 @@ class Guard:
 
     def place(self, q: Sequence[float]) -> Placement:
         """Where forearm and cup are in a joint pose."""
-        elbow, wrist = self._forearm(q)
+        return self._placed(q, *self._forearm(q))
+
+    def _placed(self, q: Sequence[float], elbow: Point, wrist: Point) -> Placement:
         turn = _Turn(q)
         offset, axis = turn.apply(self._cell.cup.mouth), turn.apply(self._cell.cup.axis)
         return Placement(elbow, wrist, (wrist[0] + offset[0], wrist[1] + offset[1], wrist[2] + offset[2]), axis)
@@ -83,14 +91,29 @@ class Guard:
 
     def violation(self, q: Sequence[float]) -> str:
         """What a joint pose would touch, in words; empty if it is clear."""
-        for number, (angle, (low, high)) in enumerate(zip(q, self._limits, strict=True), 1):
-            if not low - JOINT_SLACK <= angle <= high + JOINT_SLACK:
-                return f"joint {number} beyond its limit"
+        for angle, (low, high) in zip(q, self._limits, strict=True):
+            if not low <= angle <= high:
+                return f"joint {self._beyond(q)} beyond its limit"
         elbow, wrist = self._forearm(q)
-        touched = self._arm_touches(elbow, wrist)
+        touched = "" if self._arm_far(elbow, wrist) else self._arm_touches(elbow, wrist)
         if touched or self._far(wrist):
             return touched
-        return self._cup_touches(self.place(q))
+        return self._cup_touches(self._placed(q, elbow, wrist))
+
+    def _beyond(self, q: Sequence[float]) -> int:
+        """The first joint beyond its limit, from 1."""
+        pairs = zip(q, self._limits, strict=True)
+        return next(number for number, (angle, (low, high)) in enumerate(pairs, 1) if not low <= angle <= high)
+
+    def _arm_far(self, elbow: Point, wrist: Point) -> bool:
+        """Whether the forearm's ends are so far from everything that all of it is clear: cheap, and most often so."""
+        thick = self._thickest
+        low = min(elbow[2], wrist[2]) - thick
+        return low >= self._above_pedestal or (
+            low >= self._arm_margin
+            and (max(elbow[0], wrist[0]) + thick <= self._before_table or low >= self._above_table)
+            and math.hypot(wrist[0], wrist[1]) >= self._beside_pedestal
+        )
 
     def _far(self, wrist: Point) -> bool:
         """Whether the wrist is so far from everything that the cup is clear however it is turned."""

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from services.motion.kinematics import Puma
 from services.motion.limits import Guard
 from services.motion.model import nominal_arm, nominal_cell
-from services.motion.steering import Steering
+from services.motion.steering import CLOSER, Steering
 from services.motion.trajectory import Trajectory
 
 ARM, CELL = nominal_arm(), nominal_cell()
@@ -105,11 +105,12 @@ def test_an_arm_switched_on_in_a_forbidden_pose_may_leave_it_creeping() -> None:
     steering.limit(ARM.speed.tolist())
     steering.reset(stuck.tolist())
     steering.move(HOME.tolist())
-    fastest = np.zeros(6)
+    fastest, close = np.zeros(6), GUARD.closer(CLOSER)
     for _ in range(1000):
-        before = GUARD.violation(steering.trajectory.q)
+        before = close.violation(steering.trajectory.resting(steering.trajectory.q, steering.trajectory.qd))
         steering.cycle()
         if before:
+            assert close.violation(stuck.tolist())
             fastest = np.maximum(fastest, np.abs(steering.trajectory.qd))
     assert steering.arrived
     assert np.all(fastest <= 0.1 * ARM.speed + 1e-9)
