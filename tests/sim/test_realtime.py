@@ -276,7 +276,10 @@ def test_it_is_a_member_of_a_lock_step_cell(tmp_path: Path) -> None:
     [
         (None, "name the file with --services"),
         ("schema = 1\n[nodes.l]\nhost = '127.0.0.1'\nport = 7999\n", "write sim ="),
-        ("schema = 1\n[nodes.l]\nhost = '127.0.0.1'\nport = 7999\nsim = 'sim.laboratory:make_laboratory'\n", "[parameters] cell is missing"),
+        (
+            "schema = 1\n[nodes.l]\nhost = '127.0.0.1'\nport = 7999\nsim = 'sim.laboratory:make_laboratory'\n",
+            "[parameters] cell is missing",
+        ),
     ],
 )
 def test_a_bad_location_file_is_one_clear_error(tmp_path: Path, text: str | None, says: str) -> None:
