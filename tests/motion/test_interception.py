@@ -66,7 +66,7 @@ def test_every_nominal_ball_has_a_pose_on_its_way_that_the_arm_can_take(predicti
     )
 
 
-@settings(max_examples=40)
+@settings(max_examples=60)
 @given(THROWS, st.floats(-0.001, 0.001), st.floats(-0.005, 0.005))
 def test_small_changes_of_the_prediction_move_the_pose_a_little(prediction: Prediction, dy: float, dv: float) -> None:
     first = _plan(prediction)
@@ -79,10 +79,16 @@ def test_small_changes_of_the_prediction_move_the_pose_a_little(prediction: Pred
     if second.candidate == first.candidate:
         assert np.abs(np.subtract(second.q, first.q)).max() < 0.05
         return
-    strategy = STRATEGIES["tilted"]  # another candidate is taken only where the one of before is out of limits now
-    depth, hand = divmod(first.candidate, len(strategy.hands))
+    # Another candidate is taken only where limits or guard forbid the old one now, or have forbidden the new one before.
+    assert _alone(first.candidate, changed) is None or _alone(second.candidate, prediction) is None
+
+
+def _alone(candidate: int, prediction: Prediction) -> Plan | None:
+    """The plan if there were no other candidate."""
+    strategy = STRATEGIES["tilted"]
+    depth, hand = divmod(candidate, len(strategy.hands))
     alone = replace(strategy, depths=(strategy.depths[depth],), hands=(strategy.hands[hand],))
-    assert INTERCEPTOR.plan(alone, changed, HOME, STILL, SPEED, ACCELERATION) is None
+    return INTERCEPTOR.plan(alone, prediction, HOME, STILL, SPEED, ACCELERATION)
 
 
 @pytest.mark.parametrize("strategy", ["tilted", "upright"])
