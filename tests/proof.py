@@ -13,6 +13,7 @@ import math
 import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -111,11 +112,9 @@ def same_file_anywhere() -> Result:
 
 
 def disturbances() -> list[str]:
-    """Every disturbed regime by name, each on every speed."""
-    done = command("sim", "--list-regimes")
-    if done.returncode:
-        raise RuntimeError(done.stderr)
-    return [name for name in done.stdout.split() if name not in FLOORS]
+    """Every disturbed regime by name, each at every speed."""
+    laboratory = tomllib.loads((ROOT / "sim" / "laboratory.toml").read_text(encoding="utf-8"))
+    return [f"{speed}+{name}" for name in laboratory["disturbances"] for speed in FLOORS]
 
 
 def proofs() -> list[Proof]:
