@@ -180,9 +180,9 @@ class Callee:
         id_ = call.id
         if offer is None or offer.inline is None or id_ in self._results or id_ in self._running:
             return None
-        if (call.boot and call.boot != self.boot) or self._peers.refusal_of_call(
-            now, peer, call, offer, self._in_use
-        ) is not None:
+        if call.boot and call.boot != self.boot:
+            return None
+        if self._peers.refusal_of_call(now, peer, call, offer, self._in_use) is not None:
             return None
         outcome = self._answered(now, offer.inline, call)
         self._results.add(now, peer, outcome)

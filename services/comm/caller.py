@@ -15,26 +15,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any, Final
 
+from services.comm import messages as m
 from services.comm.events import EventIntake
-from services.comm.messages import (
-    Accept,
-    Answer,
-    Bye,
-    Call,
-    Cancel,
-    Command,
-    Event,
-    Executed,
-    Feedback,
-    Hello,
-    Message,
-    Outcome,
-    Ping,
-    Pong,
-    Refuse,
-    Subscribe,
-    Welcome,
-)
 from services.comm.notice import (
     Accepted,
     Answered,
@@ -73,7 +55,7 @@ class Caller:
     With `auto_ack` results and events are acknowledged at once; otherwise the owner says when they are safe.
     """
 
-    def __init__(self, peer: str, hello: Hello, *, auto_ack: bool = False, patience: Patience | None = None) -> None:
+    def __init__(self, peer: str, hello: m.Hello, *, auto_ack: bool = False, patience: Patience | None = None) -> None:
         self.peer = peer
         self.hello = hello
         self.up = False
@@ -91,18 +73,18 @@ class Caller:
         self._names: tuple[str, ...] | None = None
         self._events = EventIntake()
         self._settled = Settled(self._patience.acknowledge)
-        self._messages: list[Message] = []
+        self._messages: list[m.Message] = []
         self._notices: list[Notice] = []
         self._takers: Mapping[type, Callable[[float, Any], None]] = {
-            Outcome: self._take_outcome,
-            Accept: self._take_accept,
-            Feedback: self._take_feedback,
-            Event: self._take_event,
-            Answer: self._take_answer,
-            Welcome: self.link_up,
-            Refuse: self.link_refused,
-            Bye: self._take_bye,
-            Ping: self._take_ping,
+            m.Outcome: self._take_outcome,
+            m.Accept: self._take_accept,
+            m.Feedback: self._take_feedback,
+            m.Event: self._take_event,
+            m.Answer: self._take_answer,
+            m.Welcome: self.link_up,
+            m.Refuse: self.link_refused,
+            m.Bye: self._take_bye,
+            m.Ping: self._take_ping,
         }
 
     def open(self, now: float) -> None:
@@ -115,7 +97,7 @@ class Caller:
         self._held_until = now + self._patience.reconnect
         self.soonest = min(self.soonest, self._held_until)
 
-    def call(self, now: float, call: Call) -> None:
+    def call(self, now: float, call: m.Call) -> None:
         """Make a call. Raises ValueError for an id that is under way, NotPlainError for arguments that no message carries."""
         self.begin(
             now, call.id, call.service, call.arguments, call.deadline, call.parent, call.seed, call.epoch, call.boot
@@ -132,15 +114,15 @@ class Caller:
         seed: int = 0,
         epoch: int = 0,
         boot: str = "",
-        auto_ack: bool = False,
+        done: Callable[[m.Outcome], None] | None = None,
     ) -> None:
-        """`call` by the fields of a Call; with `auto_ack` its result is acknowledged as soon as it comes."""
+        """`call` by the fields of a Call. `done` is told its end in place of a notice, and its result acknowledged then."""
         if id in self._pending:
             raise ValueError(f"call {id}: this id is under way already")
         if arguments:
             arguments = plain(arguments, "arguments")
-        call = Call(id, service, arguments, deadline, epoch or self.hello.epoch, boot or self.boot, parent, seed)
-        pending = self._pending[id] = Pending(call, not boot, now, auto_ack or self._auto_ack)
+        call = m.Call(id, service, arguments, deadline, epoch or self.hello.epoch, boot or self.boot, parent, seed)
+        pending = self._pending[id] = Pending(call, not boot, now, done)
         if self.up:
             self._send(now, pending)
         elif self._refusal:
@@ -154,19 +136,19 @@ class Caller:
         if pending is None or pending.cancel is not None:
             return
         if not pending.sent and pending.any_boot:
-            self._end(id, "cancelled", reason, Executed.NO)
+            self._end(id, "cancelled", reason, m.Executed.NO)
             return
         pending.cancel = reason
         self._watch(pending, now + self._patience.stop)
         if self.up:
-            self._messages.append(Cancel(id, reason))
+            self._messages.append(m.Cancel(id, reason))
 
     def cancel_children(self, now: float, parent: str, reason: str = "") -> None:
         """Cancel all calls made on behalf of this one."""
         for id_ in [id_ for id_, pending in self._pending.items() if pending.call.parent == parent]:
             self.cancel(now, id_, reason)
 
-    def command(self, now: float, command: Command) -> None:
+    def command(self, now: float, command: m.Command) -> None:
         """Give a node-level order. Raises NotPlainError for data that no message carries."""
         if not self.up:
             self._no_answer(command.id, "unreachable")
@@ -179,7 +161,7 @@ class Caller:
         """Have these events sent from now on, also after each reconnection; replaces an earlier subscription."""
         self._names = tuple(names)
         if self.up:
-            self._messages.append(Subscribe(self._names))
+            self._messages.append(m.Subscribe(self._names))
 
     def acknowledge(self, now: float, id: str) -> None:  # noqa: A002
         """The result of this call is safe; the peer may forget it. After a restart also of a call of the time before."""
@@ -190,9 +172,9 @@ class Caller:
         """A run that the peer still keeps (`PeerBack.runs`) is of no use: stop it; its result comes as `Late`."""
         if id not in self._pending and self.up:
             self._settled.give_up(id)
-            self._messages.append(Cancel(id, "disowned"))
+            self._messages.append(m.Cancel(id, "disowned"))
 
-    def acknowledge_event(self, now: float, event: Event) -> None:
+    def acknowledge_event(self, now: float, event: m.Event) -> None:
         """This event of its source and all before it are safe."""
         ack = self._events.acknowledge(event)
         if ack is not None and self.up:
@@ -202,7 +184,7 @@ class Caller:
         """Ids of the calls that have not ended."""
         return tuple(self._pending)
 
-    def link_up(self, now: float, welcome: Welcome) -> None:
+    def link_up(self, now: float, welcome: m.Welcome) -> None:
         """The peer welcomed us: what was under way is sent again under its id, or ends if this is another boot."""
         same = welcome.boot == self.boot
         self.up, self._refusal, self._held_until = True, "", None
@@ -211,11 +193,11 @@ class Caller:
         if not same:
             self._forget_boot()
         if self._names is not None:
-            self._messages.append(Subscribe(self._names))
+            self._messages.append(m.Subscribe(self._names))
         for pending in list(self._pending.values()):
             self._send(now, pending)
             if pending.cancel is not None:
-                self._messages.append(Cancel(pending.call.id, pending.cancel))
+                self._messages.append(m.Cancel(pending.call.id, pending.cancel))
         self._settle_again(now, welcome.runs)
 
     def _forget_boot(self) -> None:
@@ -223,14 +205,14 @@ class Caller:
         self._events.clear()
         for id_, pending in list(self._pending.items()):
             if pending.sent:
-                self._end(id_, "rebooted", f"{self.peer} was started anew", Executed.UNKNOWN)
+                self._end(id_, "rebooted", f"{self.peer} was started anew", m.Executed.UNKNOWN)
         self._settled.peer_is_new()
 
     def _settle_again(self, now: float, runs: Iterable[str]) -> None:
         """Runs that the peer still keeps although they ended here: stop what was given up, acknowledge what was lost."""
         for id_ in runs:
             if self._settled.was_given_up(id_):
-                self._messages.append(Cancel(id_, "given up"))
+                self._messages.append(m.Cancel(id_, "given up"))
             elif self._settled.is_safe(id_):
                 self._ack(now, id_)
 
@@ -249,7 +231,7 @@ class Caller:
         else:
             self.connecting(now)
 
-    def link_refused(self, now: float, refuse: Refuse) -> None:
+    def link_refused(self, now: float, refuse: m.Refuse) -> None:
         """The peer refuses us: every call ends, also those to come, until it welcomes us."""
         was_up, self.up, self._held_until = self.up, False, None
         self._refusal = f"{self.peer} refuses the connection: {refuse.code}: {refuse.text}"
@@ -260,31 +242,31 @@ class Caller:
             self._no_answer(id_, "refused")
         self._end_all("refused", self._refusal)
 
-    def receive(self, now: float, message: Message) -> None:
+    def receive(self, now: float, message: m.Message) -> None:
         """Take a message of the peer; kinds that only a server is sent are left alone."""
         taker = self._takers.get(type(message))
         if taker is not None:
             taker(now, message)
 
-    def _take_outcome(self, now: float, outcome: Outcome) -> None:
+    def _take_outcome(self, now: float, outcome: m.Outcome) -> None:
         id_ = outcome.id
         pending = self._pending.pop(id_, None)
         if pending is not None:
-            if pending.auto_ack:
+            if pending.done is not None or self._auto_ack:
                 self._ack(now, id_)
             else:
                 self._settled.end(id_, False)
-            self._notices.append(Ended(outcome))
+            self._tell_end(pending, outcome)
             return
         safe = self._settled.is_safe(id_)
         if safe is None:
             self._settled.turn_up(id_)
-            if outcome.executed is not Executed.UNKNOWN:
+            if outcome.executed is not m.Executed.UNKNOWN:
                 self._notices.append(Late(outcome))
         if safe is not False:
             self._ack(now, id_)
 
-    def _take_accept(self, now: float, accept: Accept) -> None:
+    def _take_accept(self, now: float, accept: m.Accept) -> None:
         pending = self._pending.get(accept.id)
         if pending is None or pending.accepted:
             return
@@ -293,26 +275,26 @@ class Caller:
         if pending.call.deadline is not None:
             self._watch(pending, pending.made + pending.call.deadline + self._patience.stop)
 
-    def _take_feedback(self, now: float, feedback: Feedback) -> None:
+    def _take_feedback(self, now: float, feedback: m.Feedback) -> None:
         if feedback.id in self._pending:
             self._notices.append(Progress(feedback.id, feedback.fraction, feedback.data))
 
-    def _take_event(self, now: float, event: Event) -> None:
+    def _take_event(self, now: float, event: m.Event) -> None:
         new, ack = self._events.take(event, self._auto_ack)
         if ack is not None:
             self._messages.append(ack)
         if new:
             self._notices.append(EventArrived(event))
 
-    def _take_answer(self, now: float, answer: Answer) -> None:
+    def _take_answer(self, now: float, answer: m.Answer) -> None:
         if self._commands.pop(answer.id, None) is not None:
             self._notices.append(Answered(answer))
 
-    def _take_bye(self, now: float, bye: Bye) -> None:
+    def _take_bye(self, now: float, bye: m.Bye) -> None:
         self.link_down(now, bye.text or "it left")
 
-    def _take_ping(self, now: float, ping: Ping) -> None:
-        self._messages.append(Pong(ping.number))
+    def _take_ping(self, now: float, ping: m.Ping) -> None:
+        self._messages.append(m.Pong(ping.number))
 
     def advance(self, now: float) -> None:
         """End what has waited too long."""
@@ -336,11 +318,16 @@ class Caller:
         return soonest if soonest < NEVER else None
 
     @property
+    def calls(self) -> int:
+        """How many calls are under way."""
+        return len(self._pending)
+
+    @property
     def has_news(self) -> bool:
         """Whether there are notices to take out."""
         return bool(self._notices)
 
-    def messages(self, now: float | None = None) -> list[Message]:
+    def messages(self, now: float | None = None) -> list[m.Message]:
         """What to send, in order; each message is given once. Acknowledgements wait for others until `now` reaches theirs."""
         if now is None or now >= self._settled.due:
             ack = self._settled.take_acks()
@@ -382,22 +369,28 @@ class Caller:
 
     def _give_up(self, id_: str, cause: str, text: str) -> None:
         if self.up:
-            self._messages.append(Cancel(id_, cause))
-        self._end(id_, cause, text, Executed.UNKNOWN)
+            self._messages.append(m.Cancel(id_, cause))
+        self._end(id_, cause, text, m.Executed.UNKNOWN)
 
     def _end_all(self, cause: str, text: str) -> None:
         for id_, pending in list(self._pending.items()):
             if pending.sent:
-                self._end(id_, cause, text, Executed.UNKNOWN)
+                self._end(id_, cause, text, m.Executed.UNKNOWN)
             else:
                 self._end(id_, "unreachable" if cause == "lost" else cause, text, pending.if_unsent)
 
-    def _end(self, id_: str, cause: str, text: str, executed: Executed) -> None:
+    def _end(self, id_: str, cause: str, text: str, executed: m.Executed) -> None:
         pending = self._pending.pop(id_)
         if pending.sent:
             self._settled.give_up(id_)
-        self._notices.append(Ended(Outcome(id_, ERROR, {}, cause, text, executed)))
+        self._tell_end(pending, m.Outcome(id_, ERROR, {}, cause, text, executed))
+
+    def _tell_end(self, pending: Pending, outcome: m.Outcome) -> None:
+        if pending.done is not None:
+            pending.done(outcome)
+        else:
+            self._notices.append(Ended(outcome))
 
     def _no_answer(self, id_: str, cause: str) -> None:
         self._commands.pop(id_, None)
-        self._notices.append(Answered(Answer(id_, False, {"cause": cause})))
+        self._notices.append(Answered(m.Answer(id_, False, {"cause": cause})))

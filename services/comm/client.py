@@ -14,7 +14,7 @@ import random
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from services.comm.caller import Caller, Ended, Notice
+from services.comm.caller import Caller, Notice
 from services.comm.link import READ_BUFFER, Limits, Link, Timing, clock_of
 from services.comm.messages import Bye, Call, Executed, Message, Outcome, Refuse, Welcome
 from services.comm.under_way import NEVER
@@ -70,6 +70,10 @@ class _Asked(asyncio.Future[Outcome]):
 
     asked: tuple[Client, str]
 
+    def end(self, outcome: Outcome) -> None:
+        if not self.done():
+            self.set_result(outcome)
+
     def cancel(self, msg: Any = None) -> bool:
         cancelled = super().cancel(msg)
         if cancelled:
@@ -110,7 +114,6 @@ class Client:
         self._timer: asyncio.TimerHandle | None = None
         self._armed = NEVER
         self._flushing = False
-        self._futures: dict[str, asyncio.Future[Outcome]] = {}
         self._numbers = 0
         self._up = asyncio.Event()
         self._prefix = f"{caller.hello.name}/{caller.hello.boot}/"
@@ -157,10 +160,11 @@ class Client:
         self._numbers += 1
         id_ = f"{self._prefix}{self._numbers}"
         now = self.now()
-        self.caller.begin(now, id_, service, arguments, deadline, parent, seed, auto_ack=True)
-        future = self._futures[id_] = _Asked(loop=self.loop)
+        future = _Asked(loop=self.loop)
         future.asked = self, id_
-        if len(self._futures) == 1:
+        caller = self.caller
+        caller.begin(now, id_, service, arguments, deadline, parent, seed, done=future.end)
+        if caller.calls == 1:
             self.flush(now)
         elif not self._flushing:
             # Others are under way: let those that are made in this turn of the loop share one write.
@@ -194,20 +198,8 @@ class Client:
 
     def _tell(self, now: float) -> None:
         notices = self.caller.notices()
-        if not notices:
-            return
-        futures = self._futures
-        rest: list[Notice] = []
-        for notice in notices:
-            if type(notice) is Ended and notice.outcome.id in futures:
-                outcome = notice.outcome
-                future = futures.pop(outcome.id)
-                if not future.done():
-                    future.set_result(outcome)
-            else:
-                rest.append(notice)
-        if rest and self._on_notices is not None:
-            self._on_notices(now, rest)
+        if notices and self._on_notices is not None:
+            self._on_notices(now, notices)
 
     def _arm(self) -> None:
         due = self.caller.due()

@@ -36,7 +36,7 @@ class ResultStore:
         self._ids: OrderedDict[str, float] = OrderedDict()
 
     def __contains__(self, id_: str) -> bool:
-        return id_ in self._results or id_ in self._ids
+        return id_ in self._ids or id_ in self._results
 
     def add(self, now: float, peer: str, outcome: Outcome) -> None:
         """Keep a result for its caller."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
-from services.comm.messages import Call, Executed
+from services.comm.messages import Call, Executed, Outcome
 
 NEVER: Final = float("inf")
 
@@ -37,8 +37,8 @@ class Pending:
     any_boot: bool
     """Until it is sent, it may go to whatever boot the peer is; False when its owner names one."""
     made: float
-    auto_ack: bool = False
-    """Its result is acknowledged as soon as it comes."""
+    done: Callable[[Outcome], None] | None = None
+    """Told its end in place of a notice; the result is acknowledged then."""
     sent: bool = False
     accepted: bool = False
     cancel: str | None = None
