@@ -153,32 +153,19 @@ class Interceptor:
         haste = np.minimum(times / HASTE, 1.0)  # a cup that is in place already needs no margin
         slack = arrival - strategy.margin * haste - times
         closed = CLOSED_COST * np.repeat(np.maximum(strategy.opening - fall[:, 4], 0.0), hands)
-        cost = (
-            times
-            + layout.off_depth
-            + closed
-            + LATE_COST * np.maximum(-slack, 0.0)
-            + haste * np.maximum(EARLY - slack, 0.0)
-        )
+        late = LATE_COST * np.maximum(-slack, 0.0) + haste * np.maximum(EARLY - slack, 0.0)
+        cost = times + layout.off_depth + closed + late
         cost[np.isnan(cost)] = np.inf
         if before is not None and before.candidate < len(cost):
             cost[before.candidate] -= KEEP
-        for index in np.argsort(cost):
+        for index in np.argsort(cost).tolist():
             if not math.isfinite(cost[index]):
                 return None
-            pose = solved[index].tolist()
+            pose = tuple(solved[index].tolist())
             if not self._guard.violation(pose):
                 x, y, z = points[index // hands].tolist()
-                ax, ay, az = axis.tolist()
-                return Plan(
-                    tuple(pose),
-                    (x, y, z),
-                    (ax, ay, az),
-                    float(arrival[index]),
-                    float(times[index]),
-                    float(slack[index]),
-                    int(index),
-                )
+                when = float(arrival[index]), float(times[index]), float(slack[index])
+                return Plan(pose, (x, y, z), _triple(axis), *when, index)
         return None
 
     def retreat(self, q: Sequence[float]) -> tuple[float, ...] | None:
@@ -234,6 +221,11 @@ class _Layout:
         self.frames = np.empty((self.hands, 3, 3))
         self.poses = np.zeros((len(strategy.depths), self.hands, 4, 4))
         self.poses[..., 3, 3] = 1.0
+
+
+def _triple(vector: Vector) -> tuple[float, float, float]:
+    x, y, z = vector.tolist()
+    return x, y, z
 
 
 def _against(velocity: tuple[float, float, float], tilt: float) -> Vector:
