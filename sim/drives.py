@@ -219,7 +219,9 @@ class Drive(CanopenNode):
         servo = self.servo
         self._torque = tau = servo.torque(q, qd, dt)
         if state is _ENABLED:
-            self._watch(now)
+            late = now - self._synced > self._sync_patience + 1e-9
+            if late or self._error_since is not None or not -self._window <= servo.error <= self._window:
+                self._watch(now, late)
         elif state is State.FAULT_REACTION_ACTIVE and servo.ramped_down and abs(qd) < 0.02:
             self._enter(State.FAULT)
         return tau
@@ -236,9 +238,9 @@ class Drive(CanopenNode):
         """When the drive misses SYNC (s)."""
         return self._synced + self._sync_patience if self.state is _ENABLED else math.inf
 
-    def _watch(self, now: float) -> None:
+    def _watch(self, now: float, late: bool) -> None:
         """Following error (6065h, 6066h) and loss of SYNC (1006h)."""
-        if now - self._synced > self._sync_patience + 1e-9:
+        if late:
             self.trip(Fault.SYNC_LOST)
         elif -self._window <= self.servo.error <= self._window:
             self._error_since = None
