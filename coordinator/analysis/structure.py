@@ -22,6 +22,9 @@ from coordinator.net import Net
 EFFORT = 2_000
 """Rows that the enumeration of semiflows may hold at a time."""
 
+SMALL_EFFORT = 300
+"""Rows beyond which a linear program finds a Lyapunov function sooner than an enumeration does."""
+
 Vector = dict[int, int]
 """A sparse integer vector: entries that are not zero, by index."""
 
@@ -184,8 +187,8 @@ class Lyapunov:
 def lyapunov(net: Net) -> Lyapunov | None:
     """A positive integer y with y^T C <= 0, which makes the net bounded from every initial marking; None if none exists.
 
-    The sum of all P-semiflows where they cover the places, else a linear program whose solution is made rational and
-    checked exactly.
+    The sum of all P-semiflows where they cover the places, else of the minimal y >= 0 with y^T C <= 0 where their enumeration
+    stays small, else a linear program whose solution is made rational and checked exactly.
     """
     flows = place_semiflows(net)
     if flows.covers(len(net.places)):
@@ -193,6 +196,16 @@ def lyapunov(net: Net) -> Lyapunov | None:
         for y in flows.vectors:
             total = _combined(total, 1, y, 1)
         return Lyapunov(total, True)
+    rows: list[Vector] = [{} for _ in net.places]
+    for t in range(len(net.transitions)):
+        for p, change in effect(net, t).items():
+            rows[p][t] = change
+    slack: list[Vector] = [{t: 1} for t in range(len(net.transitions))]
+    falling = _semiflows(rows + slack, SMALL_EFFORT)
+    if falling.complete:
+        places = len(net.places)
+        sums = {p: sum(y.get(p, 0) for y in falling.vectors) for p in range(places)}
+        return _exact(net, np.array([float(sums[p]) for p in range(places)])) if all(sums.values()) else None
     from scipy.optimize import linprog
 
     C = incidence(net).astype(float)

@@ -72,3 +72,28 @@ def stages(k: int) -> Net:
     """k phases one after the other: an Erlang law with rates all equal."""
     places = {f"s{i}": int(i == 0) for i in range(k + 1)}
     return Net.build(places, {f"t{i}": ({f"s{i}": 1}, {f"s{i + 1}": 1}) for i in range(k)})
+
+
+def fms(n: int) -> Net:
+    """Flexible manufacturing system, n parts of each of three kinds: 22 places, 20 transitions (Ciardo & Trivedi 1993)."""
+    places: Weights = {"M1": 3, "M2": 1, "M3": 2, "P3": n, "P3M2": 0, "P3s": 0}
+    places |= dict.fromkeys(("P12", "P12wM3", "P12M3", "P12s"), 0)
+    arcs: dict[str, tuple[Weights, Weights]] = {}
+    for kind, machine, partner in (("P1", "M1", "P2"), ("P2", "M2", "P1")):
+        waits, works, done, stored, joins = (f"{kind}{s}" for s in (f"w{machine}", machine, "d", "s", f"w{partner}"))
+        places |= {kind: n} | dict.fromkeys((waits, works, done, stored, joins), 0)
+        arcs[f"arrive{kind}"] = ({kind: 1}, {waits: 1})
+        arcs[f"begin{kind}"] = ({waits: 1, machine: 1}, {works: 1})
+        arcs[f"end{kind}"] = ({works: 1}, {done: 1, machine: 1})
+        arcs[f"store{kind}"] = ({done: 1}, {stored: 1})
+        arcs[f"join{kind}"] = ({done: 1}, {joins: 1})
+        arcs[f"ship{kind}"] = ({stored: 1}, {kind: 1})
+    arcs["assemble"] = ({"P1wP2": 1, "P2wP1": 1}, {"P12": 1})
+    arcs["arriveP12"] = ({"P12": 1}, {"P12wM3": 1})
+    arcs["beginP12"] = ({"P12wM3": 1, "M3": 1}, {"P12M3": 1})
+    arcs["endP12"] = ({"P12M3": 1}, {"P12s": 1, "M3": 1})
+    arcs["shipP12"] = ({"P12s": 1}, {"P1": 1, "P2": 1})
+    arcs["beginP3"] = ({"P3": 1}, {"P3M2": 1})
+    arcs["endP3"] = ({"P3M2": 1}, {"P3s": 1})
+    arcs["shipP3"] = ({"P3s": 1}, {"P3": 1})
+    return Net.build(places, arcs)

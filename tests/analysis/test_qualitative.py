@@ -85,9 +85,7 @@ def empty_or_first(marking: Marking) -> bool:
     return sum(marking) == marking[0]
 
 
-@settings(max_examples=120, deadline=None)
-@given(st.one_of(nets(), state_machines()))
-def test_verdicts_are_those_of_the_definitions(net: Net) -> None:
+def verdicts_agree(net: Net) -> None:
     found = brute_force(net, 60)
     assume(found is not None)
     assert found is not None
@@ -95,6 +93,19 @@ def test_verdicts_are_those_of_the_definitions(net: Net) -> None:
     assert told(result) == judge(net, found, empty_or_first)
     check_witnesses(net, result)
     assert sum(d.count for d in result.deadlocks) == result.dead_markings
+
+
+@settings(max_examples=120, deadline=None)
+@given(st.one_of(nets(), state_machines()))
+def test_verdicts_are_those_of_the_definitions(net: Net) -> None:
+    verdicts_agree(net)
+
+
+@pytest.mark.proof
+@settings(max_examples=5000, deadline=None)
+@given(st.one_of(nets(), state_machines()))
+def test_verdicts_on_thousands_of_nets(net: Net) -> None:
+    verdicts_agree(net)
 
 
 @settings(max_examples=80, deadline=None)

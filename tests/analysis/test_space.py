@@ -16,7 +16,7 @@ from coordinator.analysis.explore_numpy import NumpyEngine
 from coordinator.analysis.pack import Layout, TooManyTokens
 from coordinator.analysis.space import EngineName, Limits, Space, explore
 from coordinator.net import Net
-from tests.analysis.generators import kanban, philosophers
+from tests.analysis.generators import fms, kanban, philosophers
 from tests.analysis.random_nets import brute_force, nets
 
 ENGINES: dict[str, Callable[[Explored], Engine]] = {
@@ -41,13 +41,24 @@ def listed(found: Explored) -> tuple[list[tuple[int, ...]], list[tuple[int, int,
     return markings, list(zip(source, found.label.tolist(), found.target.tolist(), strict=True))
 
 
-@settings(max_examples=150, deadline=None)
-@given(nets())
-def test_every_engine_finds_exactly_what_the_firing_rule_gives(net: Net) -> None:
+def engines_agree(net: Net) -> None:
     expected = brute_force(net, 300)
     assume(expected is not None)
     for kind in ENGINES:
         assert listed(run(kind, net)) == expected, kind
+
+
+@settings(max_examples=150, deadline=None)
+@given(nets())
+def test_every_engine_finds_exactly_what_the_firing_rule_gives(net: Net) -> None:
+    engines_agree(net)
+
+
+@pytest.mark.proof
+@settings(max_examples=5000, deadline=None)
+@given(nets(places=6, transitions=7))
+def test_every_engine_on_thousands_of_nets(net: Net) -> None:
+    engines_agree(net)
 
 
 @settings(max_examples=60, deadline=None)
@@ -199,3 +210,8 @@ def test_progress_is_told() -> None:
     told: list[tuple[int, int]] = []
     space: Space = explore(kanban(2), limits=Limits(progress=lambda found, done: told.append((found, done))))
     assert told == sorted(told) and told[-1][0] <= len(space)
+
+
+def test_fms_has_the_published_number_of_markings() -> None:
+    """3,444 markings for two parts in the Model Checking Contest's known-values list."""
+    assert (len(explore(fms(2))), explore(fms(2)).edges) == (3444, 16698)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 
+from coordinator.analysis import structure
 from coordinator.analysis.siphons import (
     controlled_siphons,
     empty_siphon,
@@ -41,7 +42,7 @@ def dense(vector: Vector, size: int) -> np.ndarray:
     return out
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(nets())
 def test_semiflows_annul_the_incidence_matrix_and_are_minimal(net: Net) -> None:
     C = incidence(net)
@@ -82,7 +83,7 @@ def test_basis_spans_the_left_kernel(net: Net) -> None:
     assert len(basis) == (np.linalg.matrix_rank(vectors) if basis else 0)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(nets())
 def test_bounds_are_never_below_what_is_reached(net: Net) -> None:
     found = brute_force(net, 200)
@@ -95,7 +96,7 @@ def test_bounds_are_never_below_what_is_reached(net: Net) -> None:
         assert linear is not None or bound is None or net.capacity[p] is not None
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(nets(inhibitors=False, capacities=False, priorities=False))
 def test_a_lyapunov_function_never_grows_and_proves_boundedness(net: Net) -> None:
     function = lyapunov(net)
@@ -108,6 +109,16 @@ def test_a_lyapunov_function_never_grows_and_proves_boundedness(net: Net) -> Non
     drift = value[space.target] - value[space.source]
     assert (drift <= 0).all()
     assert not function.conserved or not drift.any()
+
+
+@settings(max_examples=25, deadline=None)
+@given(nets(inhibitors=False, capacities=False, priorities=False))
+def test_enumeration_and_linear_program_agree_on_a_lyapunov_function(net: Net) -> None:
+    listed = lyapunov(net)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(structure, "SMALL_EFFORT", -1)
+        programmed = lyapunov(net)
+    assert (listed is None) == (programmed is None)
 
 
 def test_a_leaking_token_has_no_lyapunov_function() -> None:
@@ -160,7 +171,7 @@ def test_siphons_and_traps_are_exactly_the_minimal_ones(net: Net) -> None:
         assert largest_trap(net, trap) == trap
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(nets(weights=1, inhibitors=False, capacities=False, priorities=False))
 def test_commoners_condition_rules_out_dead_markings(net: Net) -> None:
     if controlled_siphons(net):

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from coordinator.analysis.booleans import boolean_view
 from coordinator.analysis.completion import Completion, completion
 from coordinator.analysis.gspn import Chain
 from coordinator.analysis.markov import visits_before
@@ -36,6 +37,8 @@ from coordinator.task import (
     Status,
     Task,
     Transition,
+    Variable,
+    VariableType,
 )
 from coordinator.taskfile import load
 
@@ -356,3 +359,48 @@ def test_broken_variants_are_caught_with_witnesses() -> None:
     both = (space.tokens(view.net.place_index["arm_free"]) > 0) & (space.tokens(view.net.place_index["catch_ball"]) > 0)
     assert both.any()
     assert list(view.net.replay(space.path(int(np.argmax(both)))))[-1] == space.marking(int(np.argmax(both)))
+
+
+def with_variable(initial: bool | None) -> Task:
+    """A run of `look` writes `seen`; its normal exits ask for it; a second look is only for what was not seen."""
+    task = task_of(
+        [action("look", out={"seen": "seen"})],
+        [Place("idle", Kind.CONTROL, 1), Place("found", Kind.CONTROL), Place("missed", Kind.CONTROL)],
+        [
+            Transition("go", (Input("idle"),), (Output("look"),)),
+            Transition("hit", (taken("look", End.NORMAL),), (Output("found"),), when=parse("seen")),
+            Transition("miss", (taken("look", End.NORMAL),), (Output("missed"),), when=parse("not seen")),
+            Transition("wrong", (Input("missed"),), (Output("found"),), when=parse("seen")),
+        ],
+        "found == 1 or missed == 1",
+    )
+    return replace(task, variables={"seen": Variable("seen", VariableType.BOOL, initial)})
+
+
+@pytest.mark.parametrize("initial", [True, False, None])
+def test_boolean_variables_are_kept_as_complementary_places(initial: bool | None) -> None:
+    task = with_variable(initial)
+    view = boolean_view(task)
+    space = explore(view.net)
+    names = [t for t, level in zip(view.net.transitions, examine(space).levels, strict=True) if level]
+    fired = {view.origin[name] for name in names if name in view.origin}
+    assert fired == {"go", "hit", "miss"} and "wrong" not in fired  # seen stays false behind `miss`: nothing writes it
+    values = [i for i, p in enumerate(view.net.places) if p.startswith("seen=")]
+    assert all(sum(space.marking(i)[p] for p in values) == 1 for i in range(len(space)))
+    width = len(task.net.places)
+    for i, t, j in zip(space.source.tolist(), space.label.tolist(), space.target.tolist(), strict=True):
+        before, after = space.marking(i)[:width], space.marking(j)[:width]
+        name = view.origin.get(view.net.transitions[t])
+        assert before == after if name is None else task.net.fire(before, task.net.transition_index[name]) == after
+    assert examine(explore(task.net)).dead_transitions == ()
+
+
+def test_other_conditions_are_dropped_and_too_many_variables_refused() -> None:
+    task = with_variable(False)
+    hit = replace(task.transitions["hit"], when=parse('seen and look.status == "success"'))
+    view = boolean_view(replace(task, transitions={**task.transitions, "hit": hit}))
+    assert "hit" in view.net.transitions
+    many = {f"v{i}": Variable(f"v{i}", VariableType.BOOL, False) for i in range(9)}
+    wide = replace(task.transitions["hit"], when=parse(" and ".join(many)))
+    with pytest.raises(ValueError, match="9 boolean variables"):
+        boolean_view(replace(task, variables={**task.variables, **many}, transitions={**task.transitions, "hit": wide}))
