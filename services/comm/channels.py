@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 from services.comm.canbus import Frame
 from services.comm.image import Image
 
+_FRAMES = frozenset((Frame,))
+
 
 class ImagesWanted(NamedTuple):
     """A device wants images at `rate` (1/s; 0: none); `generation` counts its wishes: images of an earlier one are dropped."""
@@ -45,7 +47,11 @@ def can_body(frames: Iterable[Frame]) -> tuple[Frame, ...]:
 
 def read_can(body: Any) -> tuple[Frame, ...]:
     """Frames of a "can" envelope, also of one that holds a single frame."""
-    return (body,) if isinstance(body, Frame) else tuple(Frame(*frame) for frame in body)
+    if isinstance(body, Frame):
+        return (body,)
+    if _FRAMES.issuperset(map(type, body)):
+        return tuple(body)
+    return tuple(Frame(*frame) for frame in body)
 
 
 def images_wanted(rate: float, generation: int) -> Mapping[str, Any]:
