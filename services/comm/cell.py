@@ -17,7 +17,7 @@ from services.comm.canbus import Frame
 from services.comm.codec import decode, encode
 from services.comm.messages import Message
 from services.comm.party import TICK, Envelope, Party, Posted
-from services.comm.plain import SCALARS, NotPlainError, pack_array, plain, unpack_array
+from services.comm.plain import SCALARS, NotPlainError, copy_array, plain
 
 _MESSAGES = frozenset(get_args(Message))
 _FLAT = frozenset((float, int, str, bytes, bool))
@@ -67,7 +67,7 @@ def as_received(channel: str, body: Any) -> Any:
         if kinds <= _FLAT or (channel == "can" and kinds == _FRAMES):
             return body
     if isinstance(body, np.ndarray):
-        return unpack_array(pack_array(body))
+        return copy_array(body)
     if isinstance(body, (tuple, list)):
         return tuple(as_received(channel, item) for item in body)
     if isinstance(body, Mapping):
