@@ -19,6 +19,7 @@ from services.vision.table import TableView
 Array = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
 NOTHING: Array = np.empty((0, 2))
+_NEIGHBOURS: Pixels = np.ones((3, 3), np.uint8)
 
 HALF = 2
 """Detectors over the whole table look at images of half the size first."""
@@ -276,7 +277,7 @@ class Window:
         peak = float(smooth.max())
         if peak < self.CONTRAST:
             return None
-        level = float(region[smooth > 0.6 * peak].mean())
+        level = cv2.mean(region, (smooth > 0.6 * peak).view(np.uint8))[0]
         return np.asarray(brighter / np.maximum(level - empty, self.CONTRAST), np.float32)
 
     def _nearest(
@@ -297,8 +298,8 @@ class Window:
             return None  # cut by the window or the image's border
         part = slice(top - 1, top + high + 1), slice(left - 1, left + wide + 1)
         # pixels of the rim count by the part that is covered, all others fully, also on the ball's shaded side
-        weight = np.clip((cover[part] - 0.15) / 0.30, 0.0, 1.0)
-        weight *= cv2.dilate(mine[part].view(np.uint8), np.ones((3, 3), np.uint8))
+        weight = np.minimum(np.maximum((cover[part] - 0.15) / 0.30, 0.0), 1.0)
+        weight *= cv2.dilate(mine[part].view(np.uint8), _NEIGHBOURS)
         total = float(weight.sum())
         u = float(weight.sum(axis=0) @ np.arange(left - 1, left + wide + 1)) / total
         v = float(weight.sum(axis=1) @ np.arange(top - 1, top + high + 1)) / total

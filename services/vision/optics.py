@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+Number = TypeVar("Number", float, Array)
 
 NEWTON_STEPS = 4
 """Newton's method on the distortion: 4 steps leave less than 1e-9 px inside the image (tests/vision/test_optics.py)."""
@@ -61,10 +62,13 @@ class Optics:
     def to_plane(self, pixels: ArrayLike, z: float) -> Array:
         """Points (..., 2), x and y, where pixels (..., 2) look through the horizontal plane at height `z` (m)."""
         at = np.asarray(pixels, float)
-        x, y = self._straighten(
-            (at[..., 0] - self.centre[0]) / self.focal[0], (at[..., 1] - self.centre[1]) / self.focal[1]
-        )
-        direction = np.stack([x, y, np.ones_like(x)], axis=-1) @ self.rotation
+        bent_x, bent_y = (at[..., 0] - self.centre[0]) / self.focal[0], (at[..., 1] - self.centre[1]) / self.focal[1]
+        if at.ndim == 1:  # one point, as in tracking: plain floats are much faster than arrays without dimension
+            straight = np.array([*self._straighten(float(bent_x), float(bent_y)), 1.0])
+        else:
+            x, y = self._straighten(bent_x, bent_y)
+            straight = np.stack([x, y, np.ones_like(x)], axis=-1)
+        direction = straight @ self.rotation
         distance = (z - self.position[2]) / direction[..., 2]
         return np.asarray(self.position[:2] + distance[..., None] * direction[..., :2])
 
@@ -73,7 +77,7 @@ class Optics:
         depth = float(self.rotation[2] @ (np.asarray(point, float) - self.position))
         return (self.focal[0] + self.focal[1]) / 2.0 / depth
 
-    def _bend(self, x: Array, y: Array) -> tuple[Array, Array, Array, Array, Array]:
+    def _bend(self, x: Number, y: Number) -> tuple[Number, Number, Number, Number, Number]:
         """Distorted image-plane coordinates and their derivatives by x and y (xx, xy = yx, yy)."""
         k1, k2, p1, p2 = self.distortion
         square = x * x + y * y
@@ -86,7 +90,7 @@ class Optics:
         yy = radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x
         return bent_x, bent_y, xx, xy, yy
 
-    def _straighten(self, bent_x: Array, bent_y: Array) -> tuple[Array, Array]:
+    def _straighten(self, bent_x: Number, bent_y: Number) -> tuple[Number, Number]:
         """Inverse of the distortion by Newton's method."""
         x, y = bent_x, bent_y
         for _ in range(NEWTON_STEPS):

@@ -172,8 +172,8 @@ class LeastSquares:
         self._solved: tuple[Array, Array, Array, Array] | None = None
         self.count = 0
 
-    def _basis(self, t: float) -> Array:
-        """(models, 4): start, speed, rolling and sliding deceleration."""
+    def _basis(self, t: float | Array) -> Array:
+        """(models, 4) at one time or at each model's own: start, speed, rolling and sliding deceleration."""
         rest = np.maximum(self.MOMENTS - t, 0.0)
         basis = np.empty((len(rest), 4))
         basis[:, 0], basis[:, 1], basis[:, 2], basis[:, 3] = 1.0, t, -0.5 * t * t, -0.5 * rest * rest
@@ -261,7 +261,7 @@ class LeastSquares:
         last = np.sqrt(np.maximum(under, 1e-6))
         ahead = np.where((under > 0.0) & (speed > 0.0), 2.0 * (along - start) / np.maximum(speed + last, 1e-6), np.inf)
         t = np.where(np.isfinite(ahead), ahead, 0.0)
-        slope = np.stack([np.ones_like(t), t, -0.5 * t * t, -0.5 * np.maximum(self.MOMENTS - t, 0.0) ** 2], axis=-1)
+        slope = self._basis(t)
         return ahead, last, np.einsum("mi,mij,mj->m", slope, covariance, slope) / last**2
 
     def _place_sigma(self, heading: Array, gap: float) -> float:
