@@ -17,7 +17,7 @@ import numpy as np
 from coordinator.analysis.completion import Completion
 from coordinator.analysis.graph import Index, sum_by
 from coordinator.analysis.gspn import Chain, Values
-from coordinator.analysis.linear import DENSE, SWEEPS, NotConverged, triangular
+from coordinator.analysis.linear import DENSE, SWEEPS, Coarse, NotConverged, triangular
 from coordinator.analysis.markov import LongRun, visits_before
 
 
@@ -139,11 +139,14 @@ def _singular(n: int, rows: Index, columns: Index, value: Values, right: Values)
         x[1:] = np.linalg.solve(matrix[1:, 1:], right[1:])
         return x
     factor, lower = triangular(n, rows, columns, value)
-    x = np.zeros(n)
-    for _ in range(SWEEPS):
+    coarse, x = Coarse(n, rows, columns), np.zeros(n)
+    for k in range(SWEEPS):
         before = x
         x = factor.solve(right + lower @ x)
         x = x - x[0]
         if np.max(np.abs(x - before)) <= 1e-12 * max(1e-300, float(np.max(np.abs(x)))):
             return np.asarray(x)
+        if coarse.is_due(k):
+            left = right + sum_by(rows, value * x[columns], n) - x
+            x = x + coarse.correction(value, left, pinned=True)
     raise NotConverged(f"the bias still moved by {np.max(np.abs(x - before)):.2e} after {SWEEPS} sweeps")

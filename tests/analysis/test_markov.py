@@ -248,6 +248,9 @@ def test_large_components_by_gauss_seidel_agree_with_elimination() -> None:
     p = 0.97 ** np.arange(2000.0)
     p /= p.sum()
     assert np.allclose(run.probability, p, atol=1e-12)
+    slope = throughput_slopes(run, "serve")["arrive"]
+    more, less = (long_run(Chain.of(Gspn.of(queue(1999), {"arrive": a, "serve": 1.0}))) for a in (0.9701, 0.9699))
+    assert slope.derivative == pytest.approx((more.throughput["serve"] - less.throughput["serve"]) / 2e-4, rel=1e-4)
     rows = np.repeat(np.arange(900), 2)
     columns = np.stack([(np.arange(900) + 1) % 900, (np.arange(900) * 7) % 900], axis=1).ravel()
     nu = stationary(900, rows, columns, np.tile([0.7, 0.3], 900))

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -281,7 +282,8 @@ def measured(measure: str, name: str, engine: str = "") -> dict[str, Any] | None
         print(f"{measure} {name}: {tool} is not installed, skipped")
         return None
     command = [sys.executable, str(Path(__file__)), "--one", measure, name, engine]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
+    one_thread = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False, env=one_thread)
     if done.returncode:
         print(f"{measure} {name}: failed: {done.stderr.strip().splitlines()[-1] if done.stderr else done.returncode}")
         return None
