@@ -74,7 +74,7 @@ class Supervisor:
         self._stopping = False
 
     async def __aenter__(self) -> Supervisor:
-        """Start all programs; raises LaunchError when one does not get ready within 30 s."""
+        """Start all programs; raises LaunchError when one does not get ready within 60 s."""
         try:
             await self.start()
         except BaseException:
@@ -86,7 +86,7 @@ class Supervisor:
         """Stop them all."""
         await self.stop()
 
-    async def start(self, timeout: float = 30.0) -> None:
+    async def start(self, timeout: float = 60.0) -> None:
         """Start all programs and wait until each is ready."""
         for first in (True, False):
             group = [child for child in self._children if child.program.first is first]
