@@ -18,6 +18,7 @@ from coordinator.analysis.graph import Graph, Mask
 from coordinator.analysis.siphons import empty_siphon
 from coordinator.analysis.space import Space
 from coordinator.analysis.structure import place_bounds
+from coordinator.analysis.stubborn import Hunt, hunt_deadlock
 from coordinator.analysis.verdict import Verdict, Witness
 from coordinator.net import Marking, Net
 
@@ -25,6 +26,8 @@ SAFETY = ""
 """Every marking of the executed task is one of the ordinary net, so what never happens here never happens there."""
 FAIRNESS = "every awaited event eventually occurs, and every status of an action is possible again and again"
 """What liveness and progress need beyond the ordinary net."""
+HUNT = 10_000
+"""Markings that the hunt for a deadlock looks at where the space is not complete."""
 GROUPS = 100
 """Groups of deadlocks that are told one by one."""
 
@@ -52,6 +55,7 @@ class Qualitative:
     deadlock_free: Verdict
     deadlocks: tuple[Deadlock, ...]
     dead_markings: int
+    """Among the markings found."""
     quasi_live: Verdict
     live: Verdict
     levels: tuple[int | None, ...]
@@ -80,6 +84,7 @@ def examine(
     bounds, bounded, safe = _boundedness(space, cover)
     ends = space.where(final) if final else np.zeros(len(space), dtype=np.bool_)
     dead = space.dead[~ends[space.dead]]
+    hunt = None if space.complete or len(dead) else hunt_deadlock(space.net, final=final, effort=HUNT)
     levels = _levels(space, graph)
     return Qualitative(
         space,
@@ -87,11 +92,11 @@ def examine(
         bounds,
         bounded,
         safe,
-        _deadlock_free(space, dead, final is not None),
-        _grouped(space, dead),
+        _deadlock_free(space, dead, final is not None, hunt),
+        _grouped(space, dead) + _hunted(space.net, hunt),
         len(dead),
         _quasi_live(space, levels),
-        _live(space, graph, levels),
+        _live(space, graph, levels, hunt),
         levels,
         _reversible(space, graph),
         _home_states(space, graph),
@@ -149,12 +154,30 @@ def _safe(space: Space, proven: bool) -> Verdict:
     return _unknown(space)
 
 
-def _deadlock_free(space: Space, dead: NDArray[np.int64], has_final: bool) -> Verdict:
+def _hunted(net: Net, hunt: Hunt | None) -> tuple[Deadlock, ...]:
+    """The deadlock found through stubborn sets, if there is one."""
+    if hunt is None or hunt.firings is None:
+        return ()
+    marked = _marked(net, hunt.firings)
+    *_, last = net.replay(hunt.firings)
+    emptied = tuple(net.places[p] for p in sorted(empty_siphon(net, last)))
+    return (Deadlock(tuple(marked), 1, Witness(hunt.firings, marked), emptied),)
+
+
+def _deadlock_free(space: Space, dead: NDArray[np.int64], has_final: bool, hunt: Hunt | None) -> Verdict:
     other = " that is not a designed end" if has_final else ""
     if len(dead):
         first = int(dead[0])
         reason = f"nothing can happen any more in {space.net.describe(space.marking(first))}"
         return Verdict(False, reason, witness(space, first), complete=space.complete)
+    for found in _hunted(space.net, hunt):
+        reason = (
+            f"nothing can happen any more with {', '.join(found.marked) or 'nothing'} marked (found by stubborn sets)"
+        )
+        return Verdict(False, reason, found.witness, complete=False)
+    if hunt is not None and hunt.complete:
+        reason = f"no reachable marking{other} is dead: {hunt.states} markings along stubborn sets stand for all"
+        return Verdict(True, reason, assumption=FAIRNESS)
     if not space.complete:
         return _unknown(space, f"no dead marking{other} among the {space.expanded} looked at")
     return Verdict(True, f"no reachable marking{other} is dead", assumption=FAIRNESS)
@@ -199,8 +222,10 @@ def _quasi_live(space: Space, levels: tuple[int | None, ...]) -> Verdict:
     return Verdict(False, f"can never fire: {', '.join(idle)}")
 
 
-def _live(space: Space, graph: Graph, levels: tuple[int | None, ...]) -> Verdict:
+def _live(space: Space, graph: Graph, levels: tuple[int | None, ...], hunt: Hunt | None) -> Verdict:
     names = space.net.transitions
+    for found in _hunted(space.net, hunt):
+        return Verdict(False, "a dead marking is reachable (found by stubborn sets)", found.witness, complete=False)
     if len(space.dead) and names:
         first = int(space.dead[0])
         reason = f"nothing can fire any more in {space.net.describe(space.marking(first))}"

@@ -243,13 +243,13 @@ def test_the_long_run_mixes_the_components_that_are_reached() -> None:
 
 
 def test_large_components_by_gauss_seidel_agree_with_elimination() -> None:
-    """A birth-death chain of 2,000 states in a closed form."""
-    run = long_run(Chain.of(Gspn.of(queue(1999), {"arrive": 0.97, "serve": 1.0})))
-    p = 0.97 ** np.arange(2000.0)
+    """A birth-death chain of 700 states in a closed form."""
+    run = long_run(Chain.of(Gspn.of(queue(699), {"arrive": 0.97, "serve": 1.0})))
+    p = 0.97 ** np.arange(700.0)
     p /= p.sum()
     assert np.allclose(run.probability, p, atol=1e-12)
     slope = throughput_slopes(run, "serve")["arrive"]
-    more, less = (long_run(Chain.of(Gspn.of(queue(1999), {"arrive": a, "serve": 1.0}))) for a in (0.9701, 0.9699))
+    more, less = (long_run(Chain.of(Gspn.of(queue(699), {"arrive": a, "serve": 1.0}))) for a in (0.9701, 0.9699))
     assert slope.derivative == pytest.approx((more.throughput["serve"] - less.throughput["serve"]) / 2e-4, rel=1e-4)
     rows = np.repeat(np.arange(900), 2)
     columns = np.stack([(np.arange(900) + 1) % 900, (np.arange(900) * 7) % 900], axis=1).ravel()
@@ -260,11 +260,11 @@ def test_large_components_by_gauss_seidel_agree_with_elimination() -> None:
 
 
 def test_completion_of_a_large_component_by_gauss_seidel() -> None:
-    """A random walk on 0..1200 that starts at 0: mean time to the top in closed form."""
-    chain = Chain.of(Gspn.of(queue(1200), {"arrive": 2.0, "serve": 1.0}))
-    done = completion(chain, chain.space.tokens(1) == 1200)
+    """A random walk on 0..700 that starts at 0: mean time to the top in closed form."""
+    chain = Chain.of(Gspn.of(queue(700), {"arrive": 2.0, "serve": 1.0}))
+    done = completion(chain, chain.space.tokens(1) == 700)
     up, down, total, step = 2.0, 1.0, 0.0, 0.0
-    for _ in range(1200):
+    for _ in range(700):
         step = (1 + down * step) / up
         total += step
     assert done.mean == pytest.approx(total, rel=1e-9)

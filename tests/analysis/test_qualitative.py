@@ -209,3 +209,19 @@ def test_scipy_and_plain_components_agree(seed: int) -> None:
     ours = _tarjan(n, graph.row.tolist(), target.tolist())
     assert len(np.unique(ours)) > 1
     assert len(np.unique(np.stack([ours, graph.components]), axis=1).T) == len(np.unique(ours))
+
+
+def test_a_deadlock_far_outside_a_partial_search_is_hunted_down() -> None:
+    """300 places, some 1e28 markings: the answer is honest and has a witness."""
+    net = philosophers(60)
+    result = examine(explore(net, limits=Limits(states=2000)))
+    assert result.deadlock_free.holds is False and result.live.holds is False and not result.live.complete
+    assert result.bounded.holds is True and result.safe.holds is True and result.reversible.holds is None
+    (found,) = result.deadlocks
+    *_, last = net.replay(found.witness.firings)
+    assert not net.enabled(last) and "fork0" in found.emptied
+
+
+def test_stubborn_sets_prove_freedom_from_deadlock_of_a_partial_search() -> None:
+    result = examine(explore(kanban(4), limits=Limits(states=1000)))
+    assert result.deadlock_free.holds is True and "stubborn sets" in result.deadlock_free.reason
