@@ -115,7 +115,9 @@ class _Node:
     parent: int
     fired: int
     ancestor: int = -1
-    """The ancestor that this node's marking strictly covers, if omega came in here."""
+    """The nearest ancestor that this node's marking strictly covers, if omega came in here."""
+    grown: tuple[int, ...] = ()
+    """Places in which it does."""
 
 
 class _Tree:
@@ -167,7 +169,10 @@ class _Tree:
             if older != covered and all(_at_least(a, b) for a, b in zip(covered, older, strict=True)):
                 wider = tuple(OMEGA if a != b else a for a, b in zip(covered, older, strict=True))
                 if wider != covered:
-                    node.ancestor, covered = up, wider
+                    if node.ancestor < 0:
+                        node.ancestor = up
+                        node.grown = tuple(p for p, (a, b) in enumerate(zip(covered, older, strict=True)) if a != b)
+                    covered = wider
             up = self.nodes[up].parent
         node.marking = covered
         self.nodes.append(node)
@@ -187,8 +192,7 @@ class _Tree:
         if self.omega is None:
             return (), (), ()
         node = self.nodes[self.omega]
-        older = self.nodes[node.ancestor].marking
-        grows = tuple(net.places[p] for p in range(self.real) if node.marking[p] == OMEGA and older[p] != OMEGA)
+        grows = tuple(net.places[p] for p in node.grown if p < self.real)
         prefix = self._fired(0, node.ancestor)
         return prefix, self._fired(node.ancestor, self.omega), grows
 

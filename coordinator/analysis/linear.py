@@ -142,14 +142,15 @@ def _sweep(n: int, rows: Index, columns: Index, value: Values, right: Values) ->
     """
     factor, lower = triangular(n, rows, columns, value)
     coarse, x = Coarse(n, rows, columns), factor.solve(right)
+    inverse: Values | None = None
     for k in range(SWEEPS):
         before = x
         x = factor.solve(right + lower @ x)
         if np.max(np.abs(x - before)) <= TOLERANCE * max(1e-300, float(np.max(np.abs(x)))):
             return np.asarray(x)
         if coarse.is_due(k):
-            left = right + sum_by(rows, value * x[columns], n) - x
-            x = x + coarse.correction(value, left)
+            inverse = coarse.inverse(value) if inverse is None else inverse
+            x = x + coarse.correction(inverse, right + sum_by(rows, value * x[columns], n) - x)
     raise NotConverged(f"Gauss-Seidel still moved by {np.max(np.abs(x - before)):.2e} after {SWEEPS} sweeps")
 
 
@@ -208,16 +209,20 @@ class Coarse:
         # A block whose probability underflows has no flow to judge by: then the sweeps go on alone.
         return np.asarray(factor[self.block]) if np.isfinite(factor).all() and factor.min() > 0 else np.ones(len(x))
 
-    def correction(self, value: Values, left: Values, pinned: bool = False) -> Values:
-        """What to add to a solution of x = right + A x whose residual is `left`: constant over each block.
+    def inverse(self, value: Values, pinned: bool = False) -> Values:
+        """The inverse of I - A seen from the blocks, for `correction`.
 
         `pinned` for a stochastic A: the first block keeps its values, since a solution is then free up to a constant.
         """
-        size = np.bincount(self.block, minlength=self.count)
+        size, first = np.bincount(self.block, minlength=self.count), int(pinned)
         matrix = np.diag(size.astype(float)) - self._matrix(value)
-        total, step, first = sum_by(self.block, left, self.count), np.zeros(self.count), int(pinned)
-        step[first:] = np.linalg.solve(matrix[first:, first:], total[first:])
-        return np.asarray(step[self.block])
+        out = np.zeros_like(matrix)
+        out[first:, first:] = np.linalg.inv(matrix[first:, first:])
+        return out
+
+    def correction(self, inverse: Values, left: Values) -> Values:
+        """What to add to a solution of x = right + A x whose residual is `left`: constant over each block."""
+        return np.asarray((inverse @ sum_by(self.block, left, self.count))[self.block])
 
 
 def gth(matrix: Values) -> Values:

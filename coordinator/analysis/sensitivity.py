@@ -140,6 +140,7 @@ def _singular(n: int, rows: Index, columns: Index, value: Values, right: Values)
         return x
     factor, lower = triangular(n, rows, columns, value)
     coarse, x = Coarse(n, rows, columns), np.zeros(n)
+    inverse: Values | None = None
     for k in range(SWEEPS):
         before = x
         x = factor.solve(right + lower @ x)
@@ -147,6 +148,6 @@ def _singular(n: int, rows: Index, columns: Index, value: Values, right: Values)
         if np.max(np.abs(x - before)) <= 1e-12 * max(1e-300, float(np.max(np.abs(x)))):
             return np.asarray(x)
         if coarse.is_due(k):
-            left = right + sum_by(rows, value * x[columns], n) - x
-            x = x + coarse.correction(value, left, pinned=True)
+            inverse = coarse.inverse(value, pinned=True) if inverse is None else inverse
+            x = x + coarse.correction(inverse, right + sum_by(rows, value * x[columns], n) - x)
     raise NotConverged(f"the bias still moved by {np.max(np.abs(x - before)):.2e} after {SWEEPS} sweeps")

@@ -18,7 +18,7 @@ def test_a_marking_is_compared_with_its_ancestors_only() -> None:
     assert (found.bounded, found.bounds, found.complete) == (True, (1, 2), True)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(nets(priorities=False, places=4, transitions=4))
 def test_bounds_are_those_of_the_markings_reached(net: Net) -> None:
     found = coverability(net, effort=3000)
@@ -33,7 +33,7 @@ def test_bounds_are_those_of_the_markings_reached(net: Net) -> None:
     assert found.bounds == tuple(max(m[p] for m in reached[0]) for p in range(len(net.places)))
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(nets(priorities=False, inhibitors=False, capacities=False, places=4, transitions=4))
 def test_a_witness_of_unboundedness_can_be_pumped_for_ever(net: Net) -> None:
     found = coverability(net, effort=3000, first_omega=True)
@@ -73,3 +73,15 @@ def test_known_nets() -> None:
     leak = Net.build({"p": 1, "q": 0}, {"t": ({"p": 1}, {"p": 1, "q": 1})})
     found = coverability(leak)
     assert found.bounded is False and found.bounds == (1, None) and found.pump == ("t",) and found.grows == ("q",)
+
+
+def test_the_witness_is_about_the_nearest_ancestor_that_is_covered() -> None:
+    """Two ancestors are covered at once: the sequence from the nearer one is the pump."""
+    net = Net.build(
+        {"p0": 0, "p3": 1}, {"t0": ({"p3": 1}, {"p0": 3}), "t1": ({}, {}), "t3": ({"p0": 3}, {"p0": 3, "p3": 1})}
+    )
+    found = coverability(net, first_omega=True)
+    assert found.bounded is False
+    *_, before = net.replay(found.prefix)
+    *_, after = net.replay(found.pump * 4, before)
+    assert all(after[net.place_index[p]] >= before[net.place_index[p]] + 4 for p in found.grows)
