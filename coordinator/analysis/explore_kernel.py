@@ -108,8 +108,7 @@ def expand_block(
 ) -> tuple[int, int, int, int]:
     """Expand markings up to number `stop`; gives (why it came back, expanded, states, edges written).
 
-    Row i of `row` gets the number of edges of the i-th marking of the block. After OVERFLOWN the first word of row
-    `states` and the following hold the successor that did not fit.
+    `row[i]` gets the number of edges of the i-th marking of the block. After OVERFLOWN row `states` is what did not fit.
     """
     able, priority, first, word, sub, guard, want, delta, guards = kernel
     out = np.empty(len(able) + 1, dtype=np.int64)
@@ -132,8 +131,7 @@ def expand_block(
                 hashed = hashed + key * factors[w]
                 hashed = hashed ^ (hashed >> np.uint64(32))
             if spilt != 0:
-                for w in range(words):
-                    keys[before, w] = keys[states, w]
+                keys[before] = keys[states]
                 return OVERFLOWN, expanded, before, edges
             # Found or added here and not by a helper: a compiled call would count references of its arrays each time.
             slot = np.int64((hashed * factors[words] >> np.uint64(20)) & mask)
@@ -147,8 +145,7 @@ def expand_block(
                 slot = (slot + 1) & np.int64(mask)
                 number = np.int64(table[slot])
             if number < 0:
-                number = np.int64(states)
-                table[slot] = states
+                number, table[slot] = np.int64(states), states
                 states += 1
             target[edges + j] = number
             label[edges + j] = t

@@ -70,6 +70,14 @@ def _ragged(rows: list[list[tuple[int, int]]]) -> tuple[Ints, Ints, Ints]:
 
 
 @jit
+def settle(area: Floats, tokens: Ints, since: Floats, now: float) -> None:
+    """Add what every place has held since its tokens last changed."""
+    for p in range(len(tokens)):
+        if now > since[p]:
+            area[p] += tokens[p] * (now - since[p])
+
+
+@jit
 def play(
     initial: Ints,
     tables: Any,
@@ -82,8 +90,7 @@ def play(
 ) -> tuple[int, float]:
     """One replica until the horizon (s) or its budget of firings; gives (firings, time observed from warmup on).
 
-    `fires` and `area` (tokens x s) get what happened from warmup on. All in one loop, without helpers: a compiled call would
-    count references of all its arrays, which takes longer than what it does.
+    `fires` and `area` (tokens x s) get what happened from warmup on. One loop without helpers: a compiled call counts references.
     """
     need_first, need_place, need_weight, bar_first, bar_place, bar_threshold = tables[:6]
     move_first, move_place, move_change, touch_first, touch = tables[6:11]
@@ -100,19 +107,16 @@ def play(
                 if have < weight:
                     able = False
                     break
-                if degree > 1:
-                    degree = min(degree, have // weight)
+                degree = min(degree, have // weight) if degree > 1 else degree
             for k in range(bar_first[u], bar_first[u + 1]):
                 if tokens[bar_place[k]] >= bar_threshold[k]:
                     able = False
             amount[u] = base[u] * degree if able else 0.0
         top, total = np.int64(-1), 0.0
         for u in range(count):
-            if amount[u] > 0.0:
-                if priority[u] > top:
-                    top, total = priority[u], amount[u]
-                elif priority[u] == top:
-                    total += amount[u]
+            if amount[u] > 0.0 and priority[u] >= top:
+                total = amount[u] + (total if priority[u] == top else 0.0)
+                top = priority[u]
         stay = random.standard_exponential() / total if top == 0 else 0.0
         if top < 0 or now + stay >= horizon:
             now = horizon
@@ -134,7 +138,5 @@ def play(
             tokens[p] += move_change[k]
         fires[t] += now >= warmup
         fired += 1
-    for p in range(len(tokens)):
-        if now > since[p]:
-            area[p] += tokens[p] * (now - since[p])
+    settle(area, tokens, since, now)
     return fired, max(0.0, now - warmup)
