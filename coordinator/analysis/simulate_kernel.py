@@ -118,11 +118,9 @@ def play(
                 total = amount[u] + (total if priority[u] == top else 0.0)
                 top = priority[u]
         stay = random.standard_exponential() / total if top == 0 else 0.0
-        if top < 0 or now + stay >= horizon:
-            now = horizon
+        now = horizon if top < 0 else min(horizon, now + stay)
         if now >= horizon or fired >= budget:
             break
-        now += stay
         left = random.random() * total
         for u in range(count):
             if amount[u] > 0.0 and priority[u] == top:
