@@ -25,6 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--states", type=int, default=5_000_000, metavar="N", help="most markings (default: %(default)s)"
     )
     parser.add_argument("--seconds", type=float, metavar="S", help="longest search; what was found until then is told")
+    parser.add_argument("--memory", type=int, default=2048, metavar="MIB", help="most memory (default: %(default)s)")
     parser.add_argument("--json", metavar="FILE", help="write the answer as JSON (- for standard output)")
 
 
@@ -34,7 +35,7 @@ def run(options: argparse.Namespace) -> int:
     from coordinator.analysis.space import Limits
     from coordinator.taskfile import load
 
-    limits = Limits(states=options.states, seconds=options.seconds, clock=time.monotonic)
+    limits = Limits(states=options.states, seconds=options.seconds, memory=options.memory << 20, clock=time.monotonic)
     path = task_path(options.file)
     return give(analyse_command(path, load, view=options.view, rates=options.rates, limits=limits), options.json)
 

@@ -1,16 +1,21 @@
-"""Check a task before it runs: its file, its branches and conflicts, and that every action is on some node."""
+"""Check a task before it runs: branches, conflicts, actions on nodes, and its state space for deadlock and unboundedness."""
 
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING, Any
+import time
+from typing import TYPE_CHECKING
 
 from coordinator.cli.loading import add_services_argument, load_directory, load_task, services_path, write_json
 
 if TYPE_CHECKING:
+    from coordinator.analysis.report import Analysis
     from coordinator.check import Report
+    from coordinator.task import Task
 
 EXAMPLE = "petrobot check catch_ball"
+MOST_STATES, LONGEST, MOST_MEMORY = 200_000, 5.0, 500_000_000
+"""Markings, seconds and bytes that this quick gate spends on the state space."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,23 +35,48 @@ def run(options: argparse.Namespace) -> int:
         directory = load_directory(options.services)
         offers = {action: directory.where(action) for action in directory.actions}
     report = check(task, offers)
+    analysis = None if report.errors else _analysed(task)
+    ok = report.ok and (analysis is None or not _stuck(analysis))
     if options.json:
-        write_json(options.json, _plain(task.name, report))
+        found = {} if analysis is None else {"analysis": analysis.to_json(structure=False)}
+        write_json(options.json, {"task": task.name, "ok": ok, "findings": _plain(report), **found})
     if options.json != "-":
-        print(_text(task.name, report))
-    return 2 if any(f.severity == "error" for f in report.findings) else 0
+        print(_text(task.name, report, analysis, ok))
+    return 0 if ok else 2
 
 
-def _plain(name: str, report: Report) -> dict[str, Any]:
+def _analysed(task: Task) -> Analysis:
+    from coordinator.analysis.report import analyse
+    from coordinator.analysis.space import Limits
+
+    limits = Limits(states=MOST_STATES, seconds=LONGEST, memory=MOST_MEMORY, clock=time.monotonic)
+    return analyse(task, limits=limits)
+
+
+def _stuck(analysis: Analysis) -> bool:
+    """Whether the task is known to be unbounded or to come to a deadlock; what was not settled in time does not forbid it."""
+    found = analysis.qualitative
+    return found.bounded.holds is False or found.deadlock_free.holds is False
+
+
+def _plain(report: Report) -> list[dict[str, str]]:
     fields = ("severity", "key", "text", "remedy")
-    findings = [{field: str(getattr(finding, field)) for field in fields} for finding in report.findings]
-    return {"task": name, "ok": not any(f["severity"] == "error" for f in findings), "findings": findings}
+    return [{field: str(getattr(finding, field)) for field in fields} for finding in report.findings]
 
 
-def _text(name: str, report: Report) -> str:
+def _text(name: str, report: Report, analysis: Analysis | None, ok: bool) -> str:
     lines = [
         f"{f.severity:8}{f.key}: {f.text}" + (f"\n        {f.remedy}" if f.remedy else "") for f in report.findings
     ]
-    errors = sum(f.severity == "error" for f in report.findings)
-    verdict = f"{name}: may not run, {errors} error{'s' * (errors != 1)}" if errors else f"{name}: may run"
-    return "\n".join([*lines, verdict])
+    if analysis is not None:
+        verdicts = {True: "yes", False: "NO", None: "unknown"}
+        told = [f"{key.replace('_', ' ')} {verdicts[v.holds]}" for key, v in analysis.verdicts().items()]
+        searched = (
+            ""
+            if analysis.qualitative.space.complete
+            else "; the search was cut short (petrobot analyse goes on longer)"
+        )
+        lines.append(f"{len(analysis.qualitative.space)} markings: {', '.join(told)}{searched}")
+        if _stuck(analysis):
+            lines.append(f"petrobot analyse {name} shows how it comes to that")
+    return "\n".join([*lines, f"{name}: {'may run' if ok else 'may not run'}"])

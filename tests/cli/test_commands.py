@@ -102,6 +102,40 @@ def test_a_task_without_error_branch_is_refused(tmp_path: Path, capsys: pytest.C
     assert "error" in said.out + said.err
 
 
+def test_a_task_that_can_deadlock_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Without its honest end the skeleton can come to a dead marking: no file fault, but the state space tells."""
+    from coordinator.cli.new import TASK
+
+    path = tmp_path / "stuck.toml"
+    text = TASK.replace("{name}", "stuck")
+    path.write_text(text, encoding="utf-8")
+    assert main(["check", str(path)]) == 2  # its actions are on no node of the shipped services.toml
+    services = tmp_path / "services.toml"
+    action = '[actions.{0}]\nrun = "services.action:success"\ntask = "{0}"\nnode = "robot"\n'
+    node = 'schema = 1\n[nodes.robot]\nhost = "127.0.0.1"\nport = 7399\n'
+    services.write_text(node + action.format("work") + action.format("recover"), encoding="utf-8")
+    assert main(["check", str(path), "--services", str(services)]) == 0
+    path.write_text(text.replace('final_error = "out_of_order == 1"\n', ""), encoding="utf-8")
+    capsys.readouterr()
+    assert main(["check", str(path), "--services", str(services)]) == 2
+    assert "deadlock free NO" in capsys.readouterr().out
+    assert main(["analyse", str(path)]) == 1
+    assert "failed" in capsys.readouterr().out
+
+
+def test_analyse_and_convert(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The shipped task is sound; as PNML it is the same net."""
+    assert main(["analyse", "catch_ball", "--json", "-"]) == 0
+    whole = json.loads(capsys.readouterr().out)
+    assert (whole["bounded"], whole["deadlock"], whole["complete"]) == (True, False, True)
+    target = tmp_path / "net.pnml"
+    assert main(["convert", "catch_ball", str(target)]) == 0
+    capsys.readouterr()
+    main(["analyse", str(target), "--json", "-"])
+    foreign = json.loads(capsys.readouterr().out)
+    assert (foreign["states"], foreign["edges"]) == (whole["states"], whole["edges"])
+
+
 def test_show_draws_svg(capsys: pytest.CaptureFixture[str]) -> None:
     """Error branches only when asked for."""
     assert main(["show", "catch_ball"]) == 0
