@@ -28,7 +28,8 @@ if browser_missing() and os.environ.get("CI") != "true":
 from playwright.async_api import Browser, Locator, async_playwright, expect
 from playwright.async_api import Page as Tab
 
-pytestmark = pytest.mark.asyncio(loop_scope="module")
+# A real browser beside a test run on two cores is late now and then; what fails three times in a row is broken.
+pytestmark = [pytest.mark.asyncio(loop_scope="module"), pytest.mark.flaky(reruns=2)]
 Watch = Callable[[Any], list[str]]
 SIZE = {"width": 1440, "height": 900}
 
