@@ -94,15 +94,15 @@ async def empty_and_home(
 
 
 async def reset_and_home(ctx: Context, *, speed: float = 0.3, timeout: float = 15.0) -> Result:
-    """Reset faults, enable the drives again and bring the arm home slowly. ERROR as the servo says if they stay in fault."""
+    """Reset faults, enable the drives again and bring the arm home slowly, and empty
+    the cup if a ball lies in it: the next one would find no room. ERROR as the servo says if they stay in fault."""
     until = ctx.now + timeout
     why = await _command(ctx, {"do": "reset"})
     if why:
         return error("refused", why)
     if not await ctx.wait(lambda: bool(ctx.device.state["enabled"]), max(0.0, until - ctx.now)):
         return _trouble(ctx.device.state) or error("arm_timeout", f"the drives were not enabled within {timeout} s")
-    stuck = await _go(ctx, "home", speed, until)
-    return success() if stuck is None else stuck
+    return await empty_and_home(ctx, speed=speed, timeout=max(0.0, until - ctx.now))
 
 
 async def _intercept(ctx: Context, how: Mapping[str, Any], timeout: float, patience: float, sigma: float) -> Result:

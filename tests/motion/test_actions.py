@@ -232,3 +232,12 @@ def test_actions_that_find_the_drives_off_say_so(make_rig: Any, make_play: Any) 
         result = play.play(action)
         assert (result.status, result.cause) == (Status.ERROR, "refused")
         assert "not enabled" in result.text
+
+
+def test_reset_and_home_turns_a_full_cup_over(play: Any) -> None:
+    """Seen after a resumed run: a ball left in the cup by recovery kept the next one from being thrown."""
+    play.rig.drives.ball(True)
+    play.rig.run(0.1)
+    play.device.state = play.rig.arm.state()
+    play.play(actions.reset_and_home(play, timeout=40.0))
+    assert [body.get("pose") for body in play.device.sent if body["do"] == "move"][:3] == ["home", "empty", "home"]
