@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from coordinator.engine import Engine
-from coordinator.executor import Executor, FirstAlternative, Forgetful, Observer, Selector, Store
+from coordinator.executor import Executor
 from coordinator.journal import Journal, JournalWriter
 from coordinator.lockstep_party import NAME, CoordinatorParty
 from coordinator.mission import Mission
+from coordinator.partners import FirstAlternative, Forgetful, Observer, Selector, Store
 from coordinator.realtime import key_of
 from coordinator.recording import EPOCH, JournalStore, boots, last_epoch, replay
 from coordinator.supervisor import Program, is_local

@@ -25,10 +25,10 @@ from coordinator.engine import (
     Step,
     Stimulus,
 )
-from coordinator.executor import FirstAlternative
 from coordinator.hmi.feed import Feed
 from coordinator.hmi.narrator import Narrator
 from coordinator.mission import Stage
+from coordinator.partners import FirstAlternative
 from coordinator.realtime import RealtimeMission
 from services.comm.messages import Command
 from services.comm.notice import Progress

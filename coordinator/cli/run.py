@@ -113,8 +113,8 @@ def _refuse_unfit(task: Task, directory: Directory) -> None:
 
 
 def _setting(task: Task, directory: Directory, options: argparse.Namespace) -> Setting:
-    from coordinator.executor import FirstAlternative
     from coordinator.launch import Setting
+    from coordinator.partners import FirstAlternative
 
     given = dict(_pairs("--set", options.set))
     if options.regime is not None:
@@ -290,10 +290,10 @@ async def _page(shell: RealtimeMission, options: argparse.Namespace) -> AsyncIte
         yield
         return
     from coordinator.cli.loading import SHIPPED
-    from coordinator.executor import FirstAlternative
     from coordinator.hmi.journals import JournalHistory
     from coordinator.hmi.server import start_page
     from coordinator.operation import Operation
+    from coordinator.partners import FirstAlternative
 
     selector = shell.mission.executor.selector
     assert isinstance(selector, FirstAlternative)

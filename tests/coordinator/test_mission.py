@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from coordinator.executor import FirstAlternative
 from coordinator.launch import Setting, lockstep_cell
 from coordinator.mission import Mission
+from coordinator.partners import FirstAlternative
 from coordinator.task import Status, Task
 from coordinator.timeline import Timeline
 from services.action import Status as ActionStatus
