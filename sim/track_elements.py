@@ -1,0 +1,134 @@
+"""One element of the chessboard track: how it crosses its square, its centre line, and how far points lie within its paint."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Square = tuple[int, int]
+"""Column and row: it reaches from 2 i to 2 i + 2 m in x and from 2 j to 2 j + 2 m in y."""
+
+SQUARE: Final = 2.0
+"""m, side of a square."""
+RADIUS: Final = 1.0
+"""m, of an arc's centre line."""
+HALF_WIDTH: Final = 0.025
+"""m, half the track's width."""
+BAR_LENGTH, BAR_WIDTH = 0.50, 0.05
+"""m, of the T's crossbar."""
+BAR_MARGIN: Final = 0.25
+"""m between the crossbar and the end of its square: paint of one colour all around it, or it would be no T."""
+_DIRECTIONS: Final = ((1, 0), (0, 1), (-1, 0), (0, -1))
+"""Unit vectors of the headings 0, 90, 180, 270 degrees."""
+
+
+class Kind(StrEnum):
+    """What an element is, seen by who enters it."""
+
+    STRAIGHT = "S"
+    LEFT = "L"
+    RIGHT = "R"
+
+    @property
+    def length(self) -> float:
+        """Of the centre line, m."""
+        return SQUARE if self is Kind.STRAIGHT else 0.5 * math.pi * RADIUS
+
+    @property
+    def turn(self) -> int:
+        """Quarter turns to the left from its entrance to its exit."""
+        return {Kind.STRAIGHT: 0, Kind.LEFT: 1, Kind.RIGHT: -1}[self]
+
+
+class Pose(NamedTuple):
+    """A point of the floor (m) and a heading (rad, counter-clockwise from x)."""
+
+    x: float
+    y: float
+    heading: float
+
+
+@dataclass(frozen=True, slots=True)
+class Element:
+    """One element. `heading` counts quarter turns from x; `start` is its entrance's arc length (m)."""
+
+    kind: Kind
+    square: Square
+    heading: int
+    start: float
+    painted: bool = True
+
+    @property
+    def end(self) -> float:
+        """Its exit's arc length (m)."""
+        return self.start + self.kind.length
+
+    @property
+    def entrance(self) -> tuple[float, float]:
+        """Where it is entered (m)."""
+        dx, dy = _DIRECTIONS[self.heading]
+        return (self.square[0] + 0.5 * (1 - dx)) * SQUARE, (self.square[1] + 0.5 * (1 - dy)) * SQUARE
+
+    def at(self, way: float) -> Pose:
+        """The pose `way` metres after the entrance; before the entrance and after the exit the line goes on straight."""
+        turn, inside = self.kind.turn, min(max(way, 0.0), self.kind.length)
+        if turn:
+            angle = inside / RADIUS
+            u, w = RADIUS * math.sin(angle), turn * RADIUS * (1.0 - math.cos(angle))
+        else:
+            angle, u, w = 0.0, inside, 0.0
+        beyond = way - inside
+        u, w = u + beyond * math.cos(angle), w + beyond * turn * math.sin(angle)
+        (x, y), (dx, dy) = self.entrance, _DIRECTIONS[self.heading]
+        return Pose(x + u * dx - w * dy, y + u * dy + w * dx, self.heading * 0.5 * math.pi + turn * angle)
+
+    def nearest(self, x: float, y: float) -> tuple[float, float, float]:
+        """Way after the entrance (m, within the element), offset to the left (m) and distance (m) of a point."""
+        (x0, y0), (dx, dy) = self.entrance, _DIRECTIONS[self.heading]
+        u, w = (x - x0) * dx + (y - y0) * dy, (y - y0) * dx - (x - x0) * dy
+        if self.kind is Kind.STRAIGHT:
+            way = min(max(u, 0.0), SQUARE)
+            return way, w, math.hypot(u - way, w)
+        turn = self.kind.turn
+        angle = min(max(math.atan2(u, RADIUS - turn * w), 0.0), 0.5 * math.pi)
+        aside = math.hypot(u - RADIUS * math.sin(angle), turn * w - RADIUS * (1.0 - math.cos(angle)))
+        return angle * RADIUS, turn * (RADIUS - math.hypot(u, RADIUS - turn * w)), aside
+
+    def depth(self, x: Array, y: Array) -> Array:
+        """How far (m) points (...,) of its square lie within the track, were it painted; negative outside."""
+        (x0, y0), (dx, dy) = self.entrance, _DIRECTIONS[self.heading]
+        u, w = (x - x0) * dx + (y - y0) * dy, (y - y0) * dx - (x - x0) * dy
+        aside = w if self.kind is Kind.STRAIGHT else np.hypot(u, RADIUS - self.kind.turn * w) - RADIUS
+        inside: Array = HALF_WIDTH - np.abs(aside)
+        return inside
+
+    def tee_depth(self, x: Array, y: Array) -> Array:
+        """The same where a straight element ends in a T: a crossbar before its exit, and nothing beyond that."""
+        (x0, y0), (dx, dy) = self.entrance, _DIRECTIONS[self.heading]
+        u, w = (x - x0) * dx + (y - y0) * dy, np.abs((y - y0) * dx - (x - x0) * dy)
+        before_end = SQUARE - BAR_MARGIN - u
+        stem = np.minimum(HALF_WIDTH - w, before_end)
+        bar = np.minimum(0.5 * BAR_LENGTH - w, np.minimum(before_end, BAR_WIDTH - before_end))
+        inside: Array = np.maximum(stem, bar)
+        return inside
+
+    @property
+    def next_square(self) -> Square:
+        """The square that lies beyond its exit."""
+        return beyond_edge(self.square, self.next_heading)
+
+    @property
+    def next_heading(self) -> int:
+        """Heading at its exit, in quarter turns."""
+        return (self.heading + self.kind.turn) % 4
+
+
+def beyond_edge(square: Square, heading: int) -> Square:
+    dx, dy = _DIRECTIONS[heading]
+    return square[0] + dx, square[1] + dy
