@@ -17,7 +17,7 @@ from coordinator.journal import Journal, JournalWriter
 from coordinator.lockstep_party import NAME, CoordinatorParty
 from coordinator.mission import Mission
 from coordinator.partners import FirstAlternative, Forgetful, Observer, Selector, Store
-from coordinator.realtime import key_of
+from coordinator.realtime import credentials_of
 from coordinator.recording import EPOCH, JournalStore, boots, last_epoch, replay
 from coordinator.supervisor import Program, is_local
 from coordinator.task import Task
@@ -118,9 +118,8 @@ def lockstep_member(
     watching = None if watch is None else lambda now: watch(mission, now)
     coordinator = CoordinatorParty(directory, mission, watching)
     delays = Delays(directory.delays())
-    member = Member(
-        NAME, [coordinator], directory.members(), delays=delays, directory=directory.hash, key=key_of(directory)
-    )
+    key = credentials_of(directory).key
+    member = Member(NAME, [coordinator], directory.members(), delays=delays, directory=directory.hash, key=key)
     return member, coordinator
 
 

@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 
 from coordinator.mission import Mission, MissionError, Stage
 from services.comm.client import Client
+from services.comm.credentials import COORDINATOR, Credentials, credentials
 from services.comm.directory import Directory
 from services.comm.notice import Notice
-from services.comm.security import read_key
 
 
 class UnreachableError(Exception):
@@ -23,14 +23,15 @@ class UnreachableError(Exception):
 class RealtimeMission:
     """Drives a mission run: what clients notice goes in, what it calls goes out, timers wake it."""
 
-    def __init__(self, mission: Mission, directory: Directory, key: bytes | None = None) -> None:
+    def __init__(self, mission: Mission, directory: Directory, proves: Credentials | None = None) -> None:
         self.mission = mission
         self._loop = asyncio.get_running_loop()
         self._over = asyncio.Event()
         self._fault: BaseException | None = None
         self._timer: asyncio.TimerHandle | None = None
+        key, tls = (proves.key, proves.client()) if proves is not None else (None, None)
         self.clients: Mapping[str, Client] = {
-            name: Client(node.host, node.port, mission.callers[name], on_notices=self._hear(name), key=key)
+            name: Client(node.host, node.port, mission.callers[name], on_notices=self._hear(name), key=key, tls=tls)
             for name, node in directory.nodes.items()
         }
 
@@ -86,6 +87,6 @@ class RealtimeMission:
         self._loop.call_soon(self.settle)
 
 
-def key_of(directory: Directory) -> bytes | None:
-    """The shared key that services.toml names, None without one. Raises what `read_key` does."""
-    return read_key(directory.file(directory.keys["file"])) if "file" in directory.keys else None
+def credentials_of(directory: Directory) -> Credentials:
+    """What the coordinator proves itself with, as services.toml says. Raises KeyFileError."""
+    return credentials(directory, COORDINATOR)

@@ -9,7 +9,7 @@ so no user code delays it; actions see a `Remote` of it: `send` a command, read 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from services.comm.canbus import CanBus
 from services.comm.image import ImageSource
@@ -88,6 +88,22 @@ class Driver(Protocol):
 
     def close(self) -> None:
         """Let the device go."""
+
+
+@runtime_checkable
+class QuickStopping(Protocol):
+    """A driver that can stop harder than its stop routine does."""
+
+    def quick_stop(self, now: float) -> None:
+        """Emergency stop (IEC 60204-1, category 0 or 1): stop at once. It stays stopped: no command comes until it is cleared."""
+
+
+def stop_at_once(driver: Driver, now: float) -> None:
+    """Emergency stop of a device: its driver's `quick_stop` if there is one, else its stop routine."""
+    if isinstance(driver, QuickStopping):
+        driver.quick_stop(now)
+    else:
+        driver.stop(now)
 
 
 class Remote(Protocol):

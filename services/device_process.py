@@ -18,7 +18,7 @@ from services.comm.plain import plain
 from services.device import Driver
 from services.pipe import NewestLink, Pipe
 from services.ports import ProcessPorts
-from services.remote import CyclicDriver, DeviceCommand
+from services.remote import CLEAR_EMERGENCY, EMERGENCY_STOP, CyclicDriver, DeviceCommand
 from services.runner import STOP_LIMIT
 from services.runs import Told, flat
 
@@ -126,6 +126,12 @@ class DeviceLoop:
             elif verb == "stop":
                 self._driver.stop(now)
                 self._tell(id_, "stopped" if self._driver.stopped() else "stopping")
+            elif verb == EMERGENCY_STOP:
+                self._cyclic.emergency_stop(now)
+                self._tell(id_, "stopped" if self._driver.stopped() else "stopping")
+            elif verb == CLEAR_EMERGENCY:
+                self._cyclic.clear_emergency()
+                self._tell(id_, "cleared")
             elif verb == "hold":
                 self._tell(id_, self._driver.hold(now))
             elif verb == "release":

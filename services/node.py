@@ -18,6 +18,7 @@ from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
 from services.inline_service import inline_service
 from services.memory import Memory, event_name
 from services.place import InlinePlace, Place
+from services.remote import CLEAR_EMERGENCY, EMERGENCY_STOP, IN_EMERGENCY
 from services.runs import Answered, Asked, Begin, Dropped, Ended, Progressed, Raised, Report, Sent, Stop, Told
 from services.timers import Timers
 
@@ -29,7 +30,9 @@ STREAM_PREFIX = "stream:"
 """Name of a stream's address service: this and the stream's name."""
 ANSWER_WITHIN = 1.0
 """Seconds that the devices have to answer an operator's command."""
-_OWN_CAUSES = ("deadline", "orphan")
+VERBS = frozenset({"hold", "release", "stop", "status", EMERGENCY_STOP, CLEAR_EMERGENCY})
+"""What a COMMAND may order."""
+_OWN_CAUSES = ("deadline", "orphan", EMERGENCY_STOP)
 _WELL_HELD = ("held", "stopped")
 
 
@@ -83,6 +86,8 @@ class Node:
         self._at: dict[str, str] = {}
         self._asked: dict[str, str] = {}
         self._commands: dict[str, _Commanded] = {}
+        self._emergency: set[str] = set()
+        """Devices that were stopped in an emergency: no run begins on them until that is cleared."""
 
     def _offers(self, waiting: Mapping[str, ActionEntry]) -> dict[str, Offer]:
         offers = {
@@ -179,18 +184,25 @@ class Node:
         deadline = call.deadline
         if deadline is None and action is not None:
             deadline = action.deadline
+        if key in self._emergency:
+            self.callee.finish(now, call.id, Status.ERROR, {}, EMERGENCY_STOP, IN_EMERGENCY, Executed.NO)
+            return
         self._at[call.id] = key
         self.places[key].take(now, Begin(call.id, call.service, call.arguments, deadline, call.seed))
 
     def _command(self, now: float, order: Commanded) -> None:
         command = order.command
         keys = [k for k in self.places if k != LOOP and command.target in ("", k or self.name)]
-        if command.verb not in ("hold", "release", "stop", "status"):
+        if command.verb not in VERBS:
             self.callee.answer(now, command.id, False, {"cause": "unknown_verb", "text": f"no verb {command.verb!r}"})
         elif not keys and command.target:
             text = f"{self.name} has no device {command.target!r}"
             self.callee.answer(now, command.id, False, {"cause": "unknown_device", "text": text})
         else:
+            if command.verb == EMERGENCY_STOP:
+                self._emergency.update(key for key in keys if key != GENERAL)
+            elif command.verb == CLEAR_EMERGENCY:
+                self._emergency.difference_update(keys)
             self._commands[command.id] = _Commanded(command.verb, now + ANSWER_WITHIN, set(keys))
             for key in keys:
                 self.places[key].command(now, command.id, command.verb)

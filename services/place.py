@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 from services.comm.directory import ActionEntry
-from services.device import Driver
-from services.remote import CyclicDriver, DeviceCommand, DirectDevice, RemoteDriver
+from services.device import Driver, stop_at_once
+from services.remote import CLEAR_EMERGENCY, EMERGENCY_STOP, CyclicDriver, DeviceCommand, DirectDevice, RemoteDriver
 from services.runner import DeviceControl, Runner
 from services.runs import Hold, Order, Report, Stop, Told
 
@@ -22,7 +22,8 @@ class Place(Protocol):
         """Take an order about a run."""
 
     def command(self, now: float, id: str, verb: str) -> None:  # noqa: A002
-        """Carry out an operator's `hold`, `release`, `stop` or `status`; a report `Told` with this id answers it."""
+        """Carry out an operator's `hold`, `release`, `stop`, `emergency_stop`, `clear_emergency` or `status`; a report
+        `Told` with this id answers it."""
 
     def advance(self, now: float) -> None:
         """Do all that is due."""
@@ -107,14 +108,25 @@ class InlinePlace:
                 driver.release(now)
             self._runner.take(now, Hold(False))
             return "released", {}
-        if verb == "stop":
+        if verb in ("stop", EMERGENCY_STOP):
             for run in self._runner.runs:
-                self._runner.take(now, Stop(run, "stopped", "by command"))
-            if driver:
-                driver.stop(now)
+                self._runner.take(now, Stop(run, "stopped" if verb == "stop" else verb, "by command"))
+            self._stop_driver(now, verb)
             return "stopped" if driver is None or driver.stopped() else "stopping", {}
+        if verb == CLEAR_EMERGENCY:
+            if self._cyclic:
+                self._cyclic.clear_emergency()
+            return "cleared", {}
         state = dict(driver.state()) if driver else {}
         return "up", {"runs": list(self._runner.runs), "fenced": self._runner.fenced, "state": state}
+
+    def _stop_driver(self, now: float, verb: str) -> None:
+        if self._cyclic is not None and verb == EMERGENCY_STOP:
+            self._cyclic.emergency_stop(now)
+        elif self._driver is not None and verb == EMERGENCY_STOP:
+            stop_at_once(self._driver, now)
+        elif self._driver is not None:
+            self._driver.stop(now)
 
     @property
     def runs(self) -> tuple[str, ...]:

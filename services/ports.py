@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from services.comm.canbus import CanBus
+from services.comm.credentials import credentials
 from services.comm.directory import DeviceEntry, Directory
 from services.comm.image import ImageSource
 from services.comm.plain import plain
-from services.comm.security import read_key
 from services.comm.stream import Incoming, StreamReceiver
 from services.setpoints import SetpointReceiver
 
@@ -64,8 +64,8 @@ class ProcessPorts:
             self._setpoints[name] = setpoint = SetpointReceiver(entry.period, self._clock)
             self._incoming[name] = Incoming(entry.period, setpoint, self._tickets[name])
         if self._receiver is None:
-            host, keys = self._directory.nodes[self._device.node].host, self._directory.keys
-            key = read_key(self._directory.file(keys["file"])) if "file" in keys else None
+            host = self._directory.nodes[self._device.node].host
+            key = credentials(self._directory, self._device.node).stream_key(self._tickets[name])
             self._receiver = StreamReceiver(self._device.name, self._incoming, host=host, key=key, clock=self._clock)
         return self._setpoints[name]
 

@@ -7,9 +7,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from services.comm.plain import plain
-from services.device import Driver
+from services.device import Driver, stop_at_once
 
 COMMAND, STOP = "command", "stop"
+EMERGENCY_STOP, CLEAR_EMERGENCY = "emergency_stop", "clear_emergency"
+"""An operator's verbs: stop at once and obey no action any more; obey actions again (nothing moves by that alone)."""
+IN_EMERGENCY = "emergency stop: clear it with `petrobot estop --clear` when the cell is safe"
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,12 +115,25 @@ class CyclicDriver:
         self.driver = driver
         self._handled = 0
         self._refused = ""
+        self._emergency = False
+
+    def emergency_stop(self, now: float) -> None:
+        """Stop at once, and refuse every command until `clear_emergency`."""
+        self._emergency = True
+        stop_at_once(self.driver, now)
+
+    def clear_emergency(self) -> None:
+        """Take commands again; the device stays as it is until one comes."""
+        self._emergency = False
 
     def take(self, now: float, command: DeviceCommand) -> None:
         """Carry out a command; what the driver refuses is told in the next state."""
         self._handled = command.number
         if command.verb == STOP:
             self.driver.stop(now)
+            return
+        if self._emergency:
+            self._refused = IN_EMERGENCY
             return
         try:
             self.driver.command(now, command.body)

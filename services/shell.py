@@ -13,9 +13,10 @@ from typing import Any
 from services.action import Status
 from services.comm.callee import Order
 from services.comm.client import Client
+from services.comm.credentials import credentials
 from services.comm.directory import Directory, DirectoryError
 from services.comm.notice import Notice
-from services.comm.security import read_key, require_key
+from services.comm.security import require_key
 from services.comm.server import Server
 from services.node import GENERAL, Node, stream_service
 from services.place import Place
@@ -36,9 +37,9 @@ class NodeShell:
         self._directory = directory
         self._name = name
         self._loop = asyncio.get_running_loop()
-        self._tickets = {s: secrets.token_hex(16) for s in directory.streams if directory.where(s) == name}
+        self._tickets = _tickets(directory, name)
         self._setup = Setup(str(directory.source), text, name, "", mock, memory, os.getpid(), self._tickets)
-        self._key = read_key(directory.file(directory.keys["file"])) if "file" in directory.keys else None
+        self._credentials = credentials(directory, name)
         self._workers = {device: self._worker_place(device) for device in self._devices()}
         places: dict[str, Place] = {**self._workers}
         self.node = Node(
@@ -50,7 +51,9 @@ class NodeShell:
             connect=self._connect,
             stream_address=self._stream_address,
         )
-        self.server = Server(self.node.callee, on_orders=self._obey, key=self._key)
+        key, tls = self._credentials.key, self._credentials.server()
+        self.server = Server(self.node.callee, on_orders=self._obey, key=key, tls=tls)
+        self._client_tls = self._credentials.client()
         self._clients: dict[str, Client] = {}
         self._tasks: set[asyncio.Task[None]] = set()
         self._timer: asyncio.TimerHandle | None = None
@@ -76,7 +79,7 @@ class NodeShell:
     async def start(self) -> None:
         """Bring the devices up, then listen. Raises DirectoryError when a device cannot be started, OSError, KeyNeededError."""
         host, port = self._directory.address(self._name)
-        require_key(self._name, host, self._key)
+        require_key(self._name, host, self._credentials.guarded)
         try:
             for place in self._workers.values():
                 place.start()
@@ -161,7 +164,8 @@ class NodeShell:
 
     def _connect(self, peer: str) -> None:
         host, port = self._directory.address(peer)
-        client = Client(host, port, self.node.callers[peer], on_notices=self._take_notices, key=self._key)
+        caller, key = self.node.callers[peer], self._credentials.key
+        client = Client(host, port, caller, on_notices=self._take_notices, key=key, tls=self._client_tls)
         self._clients[peer] = client
         client.start()
 
@@ -185,6 +189,13 @@ class NodeShell:
         if outcome.status == Status.SUCCESS:
             at = outcome.values
             self._workers[device].stream_at(stream, at["host"], at["port"], at["ticket"])
+
+
+def _tickets(directory: Directory, node: str) -> dict[str, str]:
+    """What opens each stream that a node receives: a secret of the receiving device, a dot, and one of the stream."""
+    streams = [s for s in directory.streams.values() if directory.where(s.name) == node]
+    devices = {stream.to: secrets.token_hex(16) for stream in streams}
+    return {stream.name: f"{devices[stream.to]}.{secrets.token_hex(16)}" for stream in streams}
 
 
 async def serve(directory: Directory, name: str, text: str, *, mock: str = "", memory: int = 0) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
+from services.comm.credentials import credentials
 from services.comm.directory import Directory
-from services.comm.security import read_key
 from services.comm.stream import StreamSender
 from services.runs import Sent
 
@@ -19,7 +19,7 @@ class StreamOutlets:
     def __init__(self, directory: Directory, sender: str) -> None:
         self._sender = sender
         self._periods = {s.name: s.period for s in directory.streams.values()}
-        self._key = read_key(directory.file(directory.keys["file"])) if "file" in directory.keys else None
+        self._credentials = credentials(directory, sender)
         self._outlets: dict[str, StreamSender] = {}
         self._asked: dict[str, float] = {}
 
@@ -40,7 +40,8 @@ class StreamOutlets:
             return
         if older is not None:
             older.close()
-        outlet = StreamSender(self._sender, stream, self._periods[stream], host, port, ticket=ticket, key=self._key)
+        key = self._credentials.stream_key(ticket)
+        outlet = StreamSender(self._sender, stream, self._periods[stream], host, port, ticket=ticket, key=key)
         outlet.advance()
         self._outlets[stream] = outlet
 

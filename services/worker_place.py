@@ -17,6 +17,7 @@ from services.child import Child
 from services.comm.messages import Executed
 from services.device_process import HALT, LINKED
 from services.pipe import link_pair
+from services.remote import CLEAR_EMERGENCY, EMERGENCY_STOP
 from services.runner import GRACE, STOP_LIMIT
 from services.runs import Begin, Ended, Hold, Order, Report, Stop, Told, flat, record
 from services.worker import COMMAND, FAILED, PING, PONG, READY, STREAM_AT, WANTED, Setup
@@ -94,6 +95,8 @@ class WorkerPlace:
         self._started = -math.inf
         self._restart_at: float | None = None
         self._closing = False
+        self._emergency = False
+        """Whether the device obeys nobody until that is cleared: its next process, too, is told at once."""
 
     # --- processes ---------------------------------------------------------------------------------------------------
 
@@ -129,6 +132,8 @@ class WorkerPlace:
     def _heard_owner(self, items: list[Any]) -> None:
         if items[0] == READY and items[1]["period"]:
             self._cyclic, self.streams = True, items[1]["streams"]
+            if self._emergency and self._owner is not None:
+                self._owner.post([COMMAND, EMERGENCY_STOP, EMERGENCY_STOP])
             self._start_worker()
         elif items[0] == READY:
             self._worker, self.streams = self._owner, items[1]["streams"]
@@ -298,19 +303,22 @@ class WorkerPlace:
 
     def command(self, now: float, id: str, verb: str) -> None:  # noqa: A002
         """Carry out an operator's command in the process that has the driver."""
+        if verb in (EMERGENCY_STOP, CLEAR_EMERGENCY):
+            self._emergency = verb == EMERGENCY_STOP
         target = self._owner if self._cyclic else self._worker
         if target is None or not (self._ready or self._cyclic):
             data = {"text": self.failed, "runs": list(self._runs), "pids": self.pids()}
             self._reports.append(Told(id, "not ready", data))
             return
-        if verb == "stop":
+        target.post([COMMAND, id, verb])  # first: the device waits for nobody
+        if verb in ("stop", EMERGENCY_STOP):
+            cause = "stopped" if verb == "stop" else EMERGENCY_STOP
             for run_id, run in list(self._runs.items()):
-                self._stop(now, run, Stop(run_id, "stopped", "by command"))
-        if verb == "hold":
+                self._stop(now, run, Stop(run_id, cause, "by command"))
+        elif verb == "hold":
             self._holds.add(id)
         elif verb == "release":
             self._freeze(False)
-        target.post([COMMAND, id, verb])
 
     def _freeze(self, frozen: bool) -> None:
         """Hold the runs, or let them go on with their deadlines moved by the pause."""

@@ -27,10 +27,10 @@ from typing import Final
 from services.comm.callee import Callee, Offer, Order, StartRun
 from services.comm.camera import ImageServer
 from services.comm.can_hub import Hub
+from services.comm.credentials import credentials
 from services.comm.directory import Directory
 from services.comm.messages import Call, Outcome
 from services.comm.party import TICK
-from services.comm.security import read_key
 from services.comm.server import Server
 from sim.laboratory import PREPARE, SERVICES, Laboratory
 from sim.site import site_of
@@ -147,8 +147,8 @@ class LaboratoryShell:
         self.pacemaker = Pacemaker(self.laboratory, self._hub, self._images)
         offers = {service: Offer(inline=None if service == PREPARE else self._answer) for service in SERVICES}
         callee = Callee(name, secrets.token_hex(8), offers, directory=directory.hash)
-        key = read_key(directory.file(directory.keys["file"])) if "file" in directory.keys else None
-        self.server = Server(callee, on_orders=self._obey, key=key)
+        proves = credentials(directory, name)
+        self.server = Server(callee, on_orders=self._obey, key=proves.key, tls=proves.server())
         self._preparing: set[asyncio.Task[None]] = set()
         self._thread = threading.Thread(target=self._pace, name="pacemaker", daemon=True)
         self._loop: asyncio.AbstractEventLoop | None = None

@@ -42,7 +42,7 @@ async def _ask_all(directory: Directory, timeout: float) -> dict[str, Any]:
 
 
 async def _ask(directory: Directory, node: str, timeout: float) -> dict[str, Any]:
-    from coordinator.realtime import key_of
+    from coordinator.realtime import credentials_of
     from services.comm.caller import Caller
     from services.comm.client import Client
     from services.comm.messages import Command, Hello
@@ -61,7 +61,8 @@ async def _ask(directory: Directory, node: str, timeout: float) -> dict[str, Any
             elif isinstance(notice, PeerLost):
                 refused.append(notice.reason)
 
-    client = Client(entry.host, entry.port, caller, on_notices=hear, key=key_of(directory))
+    proves = credentials_of(directory)
+    client = Client(entry.host, entry.port, caller, on_notices=hear, key=proves.key, tls=proves.client())
     client.start()
     answer: dict[str, Any] = {"address": f"{entry.host}:{entry.port}", "up": await client.connected(timeout)}
     if answer["up"]:

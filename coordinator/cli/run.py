@@ -266,12 +266,13 @@ async def drive(
     directory: Directory, mission: Mission, options: argparse.Namespace, begin: Callable[[float], None] | None = None
 ) -> None:
     """Run a mission in real time over its nodes, launching those of this host first if asked to."""
-    from coordinator.realtime import RealtimeMission, UnreachableError, key_of
+    from coordinator.realtime import RealtimeMission, UnreachableError, credentials_of
     from coordinator.supervisor import LaunchError
+    from services.comm.security import KeyFileError
 
     try:
         async with _nodes(directory, options):
-            shell = RealtimeMission(mission, directory, key_of(directory))
+            shell = RealtimeMission(mission, directory, credentials_of(directory))
             try:
                 await shell.connect()
                 async with _page(shell, options):
@@ -281,6 +282,8 @@ async def drive(
                 await shell.close()
     except (UnreachableError, LaunchError) as fault:
         raise CommandError(3, str(fault)) from fault
+    except KeyFileError as fault:
+        raise CommandError(2, str(fault)) from fault
 
 
 @asynccontextmanager

@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import random
+import ssl
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -95,9 +96,11 @@ class Client:
         *,
         on_notices: OnNotices | None = None,
         key: bytes | None = None,
+        tls: ssl.SSLContext | None = None,
         timing: Timing | None = None,
         limits: Limits | None = None,
     ) -> None:
+        """`tls`: mutual TLS; the other end must show the certificate of the caller's peer."""
         self.host = host
         self.port = port
         self.caller = caller
@@ -105,6 +108,9 @@ class Client:
         self.now = clock_of(self.loop)
         """The clock that the caller lives by: monotonic, of the loop (s)."""
         self.key = key
+        self.tls = tls
+        self.trouble = ""
+        """Why the last attempt to connect came to nothing; empty if it did not."""
         self.timing = timing or Timing()
         self.limits = limits or Limits()
         self.buffer = bytearray(READ_BUFFER)
@@ -232,11 +238,16 @@ class Client:
             pause = min(2.0 * pause, longest)
 
     async def _connect(self) -> _ClientLink | None:
+        name = self.caller.peer if self.tls is not None else None
         try:
             async with asyncio.timeout(self.timing.silence):
-                _, link = await self._loop.create_connection(lambda: _ClientLink(self), self.host, self.port)
-        except (OSError, TimeoutError):
+                _, link = await self._loop.create_connection(
+                    lambda: _ClientLink(self), self.host, self.port, ssl=self.tls, server_hostname=name
+                )
+        except (OSError, TimeoutError) as fault:
+            self.trouble = _said(fault)
             return None
+        self.trouble = ""
         self._link = link
         return link
 
@@ -248,6 +259,7 @@ class Client:
 
     def gone(self, now: float, link: _ClientLink) -> None:
         """A link is over."""
+        self.trouble = link.reason
         if self._link is link:
             self._link = None
         self._up.clear()
@@ -256,3 +268,10 @@ class Client:
         else:
             self.caller.link_down(now, link.reason, final=link.silent)
         self.flush(now)
+
+
+def _said(fault: Exception) -> str:
+    """Why there is no connection, in words."""
+    if isinstance(fault, ssl.SSLCertVerificationError):
+        return f"its certificate is not that of the node: {fault.verify_message}"
+    return str(getattr(fault, "strerror", "") or fault) or "no answer"

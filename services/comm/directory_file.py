@@ -97,10 +97,11 @@ OPEN = ("devices",)
 """Tables whose entries have keys of their own beside the known ones."""
 FLAT: Mapping[str, Key] = {
     "links": Key("a delay in seconds, 0.004 (one tick) or more", lambda v: _number(v) and v >= 0.004),
-    "keys": Key("a text", _text),
+    "keys": Key("the path of a file or folder, relative to this one", _text),
     "parameters": Key("the path of a file, relative to this one", _text),
 }
 CHANNELS = ("call", "can", "image", "stream", "control")
+KEYS = ("file", "certificates")
 COORDINATOR = "coordinator"
 TOP = ("schema", COORDINATOR, *SHAPES, *FLAT)
 
@@ -158,6 +159,11 @@ def read(text: str, source: str, memory: str) -> tuple[Tables, str, list[str]]:
     for name in tables["links"]:
         if "/" not in name and name not in CHANNELS:
             faults.add(f"links.{name}", f'unknown link; write a channel or "source/target"{nearest(name, CHANNELS)}')
+    for name in tables["keys"]:
+        if name not in KEYS:
+            faults.add(f"keys.{name}", f'unknown; write file = "cell.key" or certificates = "keys"{nearest(name, KEYS)}')
+    if len(tables["keys"]) > 1:
+        faults.add("keys", "a shared key and certificates; name one of them")
     if not faults.lines:
         _check_places(tables, faults, memory)
         _check_names(tables, faults)

@@ -45,6 +45,16 @@ class Limits:
     connections: int = 256
     opening: int = 64
     """Connections that have not shown who they are; above it the oldest of them gives way."""
+    handshakes: float = 20.0
+    """Handshakes of one address that may fail a second, on average,"""
+    handshakes_at_once: int = 100
+    """and at once; above it the address is cut off before it says a word."""
+    spare_loopback: bool = True
+    """Whether addresses of this host may fail as often as they like: one process must not lock out all others here."""
+    messages: float = 200_000.0
+    """Messages that a caller may send a second, on average: above it no more is read from it for a while,"""
+    messages_at_once: int = 20_000
+    """and at once."""
     buffer_high: int = 1 << 20
     """Bytes waiting to be sent above which a link is slow: progress and pulses are dropped, no more is read from it,"""
     buffer_hard: int = 64 << 20
@@ -106,7 +116,6 @@ class Link(asyncio.BufferedProtocol):
         """Why the link is over."""
         self.silent = False
         """Whether it is over because the other side was silent."""
-        self._buffer = buffer
         self._view = memoryview(buffer)
         self._transport: asyncio.Transport | None = None
         self._heart = Heart(0.0, timing)
@@ -142,8 +151,8 @@ class Link(asyncio.BufferedProtocol):
         self._timer = self.loop.call_at(now + self.timing.handshake, self._handshake_over)
         self.made()
 
-    def get_buffer(self, sizehint: int) -> bytearray:
-        return self._buffer
+    def get_buffer(self, sizehint: int) -> memoryview:
+        return self._view  # not the bytearray: under TLS asyncio slices it, and would read into a copy
 
     def buffer_updated(self, nbytes: int) -> None:
         data = bytes(self._view[:nbytes])

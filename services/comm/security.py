@@ -47,12 +47,13 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def require_key(name: str, host: str, key: bytes | None) -> None:
-    """Refuse to listen where other hosts can connect unless there is a key. Raises KeyNeededError."""
-    if key is None and not is_loopback(host):
+def require_key(name: str, host: str, key: bytes | bool | None) -> None:
+    """Refuse to listen where other hosts can connect unless there is a key, or certificates. Raises KeyNeededError."""
+    if not key and not is_loopback(host):
         raise KeyNeededError(
-            f"{name}: refuses to listen on {host}, which other hosts can reach, without a key; make a key file with "
-            "`petrobot keys`, copy it to each host and name it under [keys] in services.toml, or listen on 127.0.0.1"
+            f"{name}: refuses to listen on {host}, which other hosts can reach, without a key; make a key file (or "
+            "certificates) with `petrobot keys`, copy it to each host and name it under [keys] in services.toml, or "
+            "listen on 127.0.0.1"
         )
 
 

@@ -12,15 +12,21 @@ Services answered on the spot (`Offer.inline`) never leave the loop; everything 
 from __future__ import annotations
 
 import asyncio
+import ssl
 from collections.abc import Callable
 
+from services.comm.admission import Bucket, Knocks
 from services.comm.callee import Callee, Order
+from services.comm.credentials import may_speak_as, name_on
 from services.comm.link import READ_BUFFER, Limits, Link, Timing
 from services.comm.messages import Answer, Bye, Call, Hello, Message, Outcome, Refuse
 from services.comm.security import is_loopback, require_key
+from services.comm.tls_listener import TlsListener
 from services.comm.wire import ProtocolError, Side, State
 
 OnOrders = Callable[[float, list[Order]], None]
+COUNTED = 256
+"""Messages of a caller after which its rate is looked at."""
 
 
 class _ServerLink(Link):
@@ -31,12 +37,20 @@ class _ServerLink(Link):
         self._server = server
         self.peer = ""
         """The caller's name, once it is welcome."""
+        self.address = ""
+        limits = server.limits
+        self._taken = 0
+        self._budget = Bucket(limits.messages, limits.messages_at_once, self.now())
 
     def made(self) -> None:
+        self.address, _ = self.ends()
         self._server.came(self)
 
     def took(self, now: float, messages: list[Message]) -> None:
         callee, peer = self._server.callee, self.peer
+        self._taken += len(messages)
+        if self._taken >= COUNTED and not self._in_time(now):
+            return
         if peer and len(messages) == 1 and type(messages[0]) is Call:
             outcome = callee.answer_inline(now, peer, messages[0])
             if outcome is not None:
@@ -53,7 +67,40 @@ class _ServerLink(Link):
                 callee.receive(now, peer, message)
         self._server.flush(now)
 
+    def _in_time(self, now: float) -> bool:
+        """Read no more for a while from one that sends faster than it may; False: it is too much, and it must go."""
+        wait = self._budget.take(now, self._taken)
+        self._taken = 0
+        if wait <= 0.0 or self._transport is None:
+            return True
+        self._server.count("too_fast")
+        if wait > self.timing.silence / 2:
+            limits = self.limits
+            text = f"at most {limits.messages_at_once} messages at once and {limits.messages:g} a second: send fewer"
+            self.end(f"too_fast: {text}", Refuse("too_fast", text))
+            return False
+        self._transport.pause_reading()
+        self.loop.call_later(wait, self._go_on)
+        return True
+
+    def _go_on(self) -> None:
+        self._heart.heard = self.now()  # it was we who did not listen
+        if self._transport is not None and not self.slow:
+            self._transport.resume_reading()
+
+    def certified(self) -> str | None:
+        """The name on the caller's certificate; None without TLS."""
+        if self._server.tls is None or self._transport is None:
+            return None
+        return name_on(self._transport.get_extra_info("peercert"))
+
     def _greet(self, now: float, hello: Hello) -> None:
+        certified = self.certified()
+        if certified is not None and not may_speak_as(certified, hello.role, hello.name):
+            text = f"the certificate of {certified or 'nobody'} does not let you speak as {hello.role} {hello.name}"
+            self._server.count("certificate")
+            self.end(f"certificate: {text}", Refuse("certificate", text))
+            return
         answer = self._server.callee.link_up(now, hello.name, hello, local=self._is_local())
         if isinstance(answer, Refuse):
             self.end(f"{answer.code}: {answer.text}", answer)
@@ -76,7 +123,7 @@ class _ServerLink(Link):
         return None
 
     def faulted(self, opening: bool, fault: ProtocolError) -> None:
-        self._server.faults[fault.code] = self._server.faults.get(fault.code, 0) + 1
+        self._server.count(fault.code)
 
     def over(self, now: float) -> None:
         self._server.gone(self, now)
@@ -91,11 +138,14 @@ class Server:
         *,
         on_orders: OnOrders | None = None,
         key: bytes | None = None,
+        tls: ssl.SSLContext | None = None,
         timing: Timing | None = None,
         limits: Limits | None = None,
     ) -> None:
+        """`tls`: mutual TLS; each caller speaks under the name on its certificate."""
         self.callee = callee
         self.key = key
+        self.tls = tls
         self.timing = timing or Timing()
         self.limits = limits or Limits()
         self.faults: dict[str, int] = {}
@@ -105,7 +155,8 @@ class Server:
         self._links: dict[str, _ServerLink] = {}
         self._opening: dict[_ServerLink, None] = {}
         self._all: set[_ServerLink] = set()
-        self._server: asyncio.Server | None = None
+        self._server: asyncio.Server | TlsListener | None = None
+        self._knocks = Knocks(self.limits.handshakes, self.limits.handshakes_at_once)
         self._timer: asyncio.TimerHandle | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
 
@@ -116,9 +167,14 @@ class Server:
 
     async def start(self, host: str, port: int) -> None:
         """Listen. Raises KeyNeededError if other hosts could connect and there is no key, OSError if it cannot be done."""
-        require_key(self.callee.name, host, self.key)
+        require_key(self.callee.name, host, self.key or self.tls is not None)
         self._loop = asyncio.get_running_loop()
-        self._server = await self._loop.create_server(lambda: _ServerLink(self), host, port, backlog=128)
+        if self.tls is None:
+            self._server = await self._loop.create_server(lambda: _ServerLink(self), host, port, backlog=128)
+        else:
+            listener = TlsListener(host, port, self.tls, self.timing.handshake, self.limits.opening)
+            self._server = listener
+            listener.start(lambda: _ServerLink(self), self.admits, self.failed)
 
     @property
     def address(self) -> tuple[str, int]:
@@ -196,6 +252,10 @@ class Server:
 
     def came(self, link: _ServerLink) -> None:
         """A connection stands. Above the limits the oldest one that has not shown who it is gives way, else the new one."""
+        if self.tls is None and not self.admits(link.address):
+            link.cut("too many handshakes of its address have failed")
+            self.count("knocks")
+            return
         self._all.add(link)
         self._opening[link] = None
         if len(self._opening) > self.limits.opening or len(self._all) > self.limits.connections:
@@ -209,8 +269,23 @@ class Server:
         if older is not None:
             older.cut("a newer connection of its name took its place")
 
+    def count(self, fault: str) -> None:
+        """Count what a caller did wrong."""
+        self.faults[fault] = self.faults.get(fault, 0) + 1
+
+    def admits(self, address: str) -> bool:
+        """Whether a connection of this address is listened to."""
+        spared = self.limits.spare_loopback and is_loopback(address)
+        return spared or self._knocks.admits(self.now(), address)
+
+    def failed(self, address: str) -> None:
+        """A connection of this address ended before it was welcome."""
+        self._knocks.failed(self.now(), address)
+
     def gone(self, link: _ServerLink, now: float) -> None:
         """A connection is over."""
+        if link in self._opening:
+            self.failed(link.address)
         self._all.discard(link)
         self._opening.pop(link, None)
         if link.peer and self._links.get(link.peer) is link:

@@ -191,6 +191,10 @@ class Arm:
         """Decelerate at the limits, then hold."""
         self._rest("stopped")
 
+    def quick_stop(self, now: float) -> None:
+        """Emergency stop: the drives stop quickly with the next cycle; then their power goes and the brakes hold."""
+        self._master.give_up("emergency stop", "emergency_stop", 0)
+
     def stopped(self) -> bool:
         """Whether the arm stands still, held by its drives or its brakes."""
         if self._mode == "off":

@@ -251,9 +251,10 @@ class DriveMaster:
         if again:
             self.phase, self._begin_at = Phase.CONFIGURING, now
 
-    def give_up(self, why: str) -> None:
-        """The servo itself finds that the drives do not follow: stop them."""
-        self._report(Trouble("drive_fault", None, Fault.FOLLOWING_ERROR, why))
+    def give_up(self, why: str, cause: str = "drive_fault", code: int = Fault.FOLLOWING_ERROR) -> None:
+        """The servo itself stops the drives quickly, with the next cycle: they do not follow, or in an emergency."""
+        self._report(Trouble(cause, None, code, why))
+        self._enable_first = False
 
     def bus_lost(self, now: float, why: str) -> None:
         """The bus itself is gone: nothing is enabled any more; configure again when it is back."""

@@ -1,0 +1,206 @@
+"""The emergency stop: straight to the nodes that own devices, and to their bus where a node does not answer.
+
+No coordinator is needed, and none can delay it: each node is asked over a connection of its own, stops its devices at once
+(a drive's quick stop goes out with the next bus cycle) and lets no action use them until `CLEAR` comes. Where a node that
+owns a CAN bus of this host does not answer in time, all CANopen devices of that bus are stopped by NMT (CiA 301: a drive that
+leaves OPERATIONAL while it moves stops, object 6007h).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from coordinator.supervisor import is_local
+from services.comm.caller import Caller
+from services.comm.client import Client
+from services.comm.credentials import Credentials
+from services.comm.directory import Directory
+from services.comm.messages import Command, Hello
+from services.comm.notice import Answered, Notice, PeerLost
+from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
+
+STOP = "emergency_stop"
+CLEAR = "clear_emergency"
+NODE_LATE = 0.15
+"""Seconds after which a node that has not answered is passed by, over its bus."""
+STANDSTILL = 1.5
+"""Seconds that devices have to come to rest before their last answer is given as it is."""
+ASK_AGAIN = 0.02
+BUS_PATIENCE = 0.5
+BUS_TIMES, BUS_PAUSE = 3, 0.01
+"""How often the order goes on the bus, and the pause between (s): one frame may be lost."""
+
+
+@dataclass
+class Stopped:
+    """What became of one node's devices."""
+
+    node: str
+    devices: dict[str, str] = field(default_factory=dict)
+    """Each device's answer: stopped, stopping, cleared, not ready, no answer."""
+    seconds: float | None = None
+    """From the order to the first answer; None without one."""
+    why: str = ""
+    """Why there is no answer."""
+    bus: str = ""
+    """What was done on the bus in the node's place."""
+
+    @property
+    def answered(self) -> bool:
+        """Whether the node itself has answered."""
+        return self.seconds is not None
+
+
+def nodes_with_devices(directory: Directory) -> list[str]:
+    """The nodes that own devices with a driver: those that an emergency stop goes to."""
+    return list(dict.fromkeys(device.node for device in directory.devices.values() if device.driver))
+
+
+def buses_of(directory: Directory, node: str) -> list[Mapping[str, Any]]:
+    """CAN buses of a node's devices, as `services.comm.can_ports.open_can` takes them."""
+    found = []
+    for device in directory.devices.values():
+        can = device.config.get("can") or {k: device.config[k] for k in _CAN_KEYS if k in device.config}
+        if device.node == node and {"interface", "channel"} <= can.keys() and can not in found:
+            found.append(can)
+    return found
+
+
+_CAN_KEYS = ("interface", "channel", "bitrate")
+
+
+class EmergencyLine:
+    """A connection to one node for emergency stops alone. It fits every services.toml: a stop must not fail for a hash."""
+
+    def __init__(self, directory: Directory, node: str, credentials: Credentials) -> None:
+        name = f"estop-{secrets.token_hex(4)}"
+        entry = directory.nodes[node]
+        caller = Caller(node, Hello(OLDEST_VERSION, NEWEST_VERSION, "client", name, name), auto_ack=True)
+        self.node = node
+        self.why = ""
+        self._name = name
+        self._numbers = 0
+        self._answers: dict[str, asyncio.Future[Mapping[str, Any]]] = {}
+        self.client = Client(
+            entry.host, entry.port, caller, on_notices=self._hear, key=credentials.key, tls=credentials.client()
+        )
+
+    async def connect(self, timeout: float) -> bool:
+        """Whether the node lets us in within so many seconds; `why` says why not."""
+        self.client.start()
+        up = await self.client.connected(timeout)
+        if not up and not self.why:
+            self.why = f"nobody answers on {self.client.host}:{self.client.port}"
+        return up
+
+    async def order(self, verb: str, timeout: float) -> dict[str, str] | None:
+        """Give an order; each device's answer, or None when there was none in time."""
+        self._numbers += 1
+        identity = f"{self._name}/{verb}#{self._numbers}"
+        told = self._answers[identity] = asyncio.get_running_loop().create_future()
+        self.client.caller.command(self.client.now(), Command(identity, verb))
+        self.client.flush()
+        try:
+            async with asyncio.timeout(timeout):
+                data = await told
+        except TimeoutError:
+            self.why = self.why or f"no answer within {timeout:g} s"
+            return None
+        finally:
+            self._answers.pop(identity, None)
+        answers = data.get("answers")
+        if isinstance(answers, Mapping):
+            return {str(device): str(answer) for device, answer in answers.items()}
+        self.why = str(data.get("text") or data.get("cause") or "an answer that says nothing")
+        return None
+
+    async def close(self) -> None:
+        """Hang up."""
+        await self.client.close()
+
+    def _hear(self, _: float, notices: list[Notice]) -> None:
+        for notice in notices:
+            if isinstance(notice, Answered):
+                told = self._answers.get(notice.answer.id)
+                if told is not None and not told.done():
+                    told.set_result(notice.answer.data)
+            elif isinstance(notice, PeerLost):
+                self.why = notice.reason
+
+
+async def order_all(
+    directory: Directory, credentials: Credentials, verb: str = STOP, *, bus: Callable[[str], bool] | None = None
+) -> list[Stopped]:
+    """Give an order to every node that owns devices, all at once. `bus(node)`: whether to stop its bus in any case."""
+    nodes = nodes_with_devices(directory)
+    return list(await asyncio.gather(*(_order(directory, credentials, n, verb, bus) for n in nodes)))
+
+
+async def _order(
+    directory: Directory, credentials: Credentials, node: str, verb: str, bus: Callable[[str], bool] | None
+) -> Stopped:
+    stopped = Stopped(node)
+    line = EmergencyLine(directory, node, credentials)
+    asking = asyncio.create_task(_ask(line, stopped, verb))
+    try:
+        if verb == STOP:
+            wait = 0.0 if bus is not None and bus(node) else NODE_LATE
+            await asyncio.wait({asking}, timeout=wait)
+            if not stopped.answered or not wait:
+                stopped.bus = await _stop_buses(directory, node)
+        await asking
+    finally:
+        await line.close()
+    return stopped
+
+
+async def _ask(line: EmergencyLine, stopped: Stopped, verb: str) -> None:
+    """Order until all devices stand; the first answer counts for `seconds`."""
+    loop = asyncio.get_running_loop()
+    begun = loop.time()
+    if await line.connect(STANDSTILL):
+        while True:
+            answers = await line.order(verb, STANDSTILL)
+            if answers is None:
+                break
+            if stopped.seconds is None:
+                stopped.seconds = loop.time() - begun
+            stopped.devices = answers
+            if "stopping" not in answers.values() or loop.time() - begun > STANDSTILL:
+                return
+            await asyncio.sleep(ASK_AGAIN)
+    stopped.why = line.why
+
+
+async def _stop_buses(directory: Directory, node: str) -> str:
+    """Stop every CANopen device on the node's buses by NMT; says what was done."""
+    buses = buses_of(directory, node)
+    if not buses:
+        return ""
+    if not await asyncio.to_thread(is_local, directory.nodes[node].host):
+        return "its bus is on another host: run `petrobot estop --bus` there, or press the hardware's emergency stop"
+    return "; ".join([await asyncio.to_thread(_stop_bus, can) for can in buses])
+
+
+def _stop_bus(can: Mapping[str, Any]) -> str:
+    from services.comm.can_ports import open_can  # python-can takes long to import, and most stops need no bus
+    from services.comm.canopen import NmtCommand, nmt
+
+    patience = {"timeout": BUS_PATIENCE} if can["interface"] == "petrobot_stream" else {}
+    try:
+        port = open_can({**can, **patience})
+        try:
+            for _ in range(BUS_TIMES):
+                port.send(nmt(NmtCommand.STOP))
+                time.sleep(BUS_PAUSE)
+                port.receive()  # what is left unread when a socket closes may cost the other end what we have sent
+        finally:
+            port.close()
+    except (ConnectionError, ValueError, OSError) as fault:
+        return f"bus {can['channel']}: {fault}"
+    return f"bus {can['channel']}: all devices stopped by NMT"
