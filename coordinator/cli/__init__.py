@@ -34,6 +34,8 @@ COMMANDS = (
     Command("run", "run a task"),
     Command("resume", "go on with a run whose coordinator was killed"),
     Command("log", "print or export a recorded run"),
+    Command("campaign", "run a task many times in parallel lock-step cells"),
+    Command("learned", "what was learned: show, merge, freeze, reset an estimates file"),
     Command("replay", "derive a recorded run again and compare"),
     Command("check", "check a task before it runs"),
     Command("analyse", "verify a net or task, and forecast it"),

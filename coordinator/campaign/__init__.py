@@ -1,0 +1,1 @@
+"""Campaigns: many mission runs of a task in parallel lock-step cells, one table row for each run of the task."""

@@ -1,0 +1,136 @@
+"""Local worker processes of a campaign: a lost one is replaced and its block done again, an old one retires."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from coordinator.campaign.plan import CampaignError, Plan
+
+RETIRES_AFTER = 40
+"""Blocks after which a worker is replaced, so that what leaks in native libraries does not add up."""
+TRIES = 3
+"""Workers that a block may take with it before it counts as the block's fault."""
+LONGEST_LINE = 1 << 26
+
+
+class WorkerLost(Exception):  # noqa: N818 - what happened
+    """A worker process ended while it had a block."""
+
+
+class _Worker:
+    """One process and the way to it."""
+
+    def __init__(self, process: asyncio.subprocess.Process) -> None:
+        self.process = process
+        self.done = 0
+
+    @classmethod
+    async def start(cls, plan: str, log: Path) -> _Worker:
+        """Launch a process and tell it the plan; what it says beside its answers goes to `log`."""
+        pipe = asyncio.subprocess.PIPE
+        command = (sys.executable, "-m", "coordinator.campaign.worker")
+        environment = {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(p for p in sys.path if p),
+            "OPENBLAS_NUM_THREADS": "1",
+        }
+        with log.open("ab") as said:
+            process = await asyncio.create_subprocess_exec(
+                *command,
+                stdin=pipe,
+                stdout=pipe,
+                stderr=said,
+                env=environment,
+                limit=LONGEST_LINE,
+                start_new_session=True,
+            )
+        worker = cls(process)
+        await worker._tell(plan)
+        return worker
+
+    async def ask(self, order: str) -> dict[str, Any]:
+        """Hand over a block and wait for its result. Raises WorkerLost."""
+        assert self.process.stdout is not None
+        await self._tell(order)
+        line = await self.process.stdout.readline()
+        if not line.endswith(b"\n"):
+            raise WorkerLost(f"worker {self.process.pid} ended")
+        self.done += 1
+        return json.loads(line)  # type: ignore[no-any-return]
+
+    async def _tell(self, line: str) -> None:
+        assert self.process.stdin is not None
+        try:
+            self.process.stdin.write(line.encode() + b"\n")
+            await self.process.stdin.drain()
+        except (BrokenPipeError, ConnectionResetError) as fault:
+            raise WorkerLost(f"worker {self.process.pid} ended") from fault
+
+    async def end(self) -> None:
+        """Kill the process if it is still there."""
+        with contextlib.suppress(ProcessLookupError):
+            self.process.kill()
+        await self.process.wait()
+
+
+class LocalPool:
+    """`count` worker processes; use as an async context."""
+
+    def __init__(self, plan: Plan, count: int, log: Path) -> None:
+        self.count = count
+        self._log = log
+        self.lost = 0
+        """Workers that ended while they had a block."""
+        self._plan = json.dumps(plan.to_plain())
+        self._idle: list[_Worker] = []
+        self._all: set[_Worker] = set()
+        self._room = asyncio.Semaphore(count)
+
+    @property
+    def pids(self) -> list[int]:
+        """Of the processes that are there."""
+        return [worker.process.pid for worker in self._all]
+
+    async def __aenter__(self) -> LocalPool:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await asyncio.gather(*(worker.end() for worker in self._all))
+
+    async def run(self, order: Mapping[str, Any]) -> dict[str, Any]:
+        """Have a block done; waits for a worker. Raises CampaignError."""
+        text = json.dumps(order)
+        async with self._room:
+            for _ in range(TRIES):
+                try:
+                    return await self._once(text)
+                except WorkerLost:
+                    self.lost += 1
+        what = f"block {order['block']['index']} (seed {order['block']['seed']})"
+        raise CampaignError(f"{what} ended {TRIES} workers; the last words of each are in {self._log}")
+
+    async def _once(self, text: str) -> dict[str, Any]:
+        if self._idle:
+            worker = self._idle.pop()
+        else:
+            worker = await _Worker.start(self._plan, self._log)
+            self._all.add(worker)
+        try:
+            answer = await worker.ask(text)
+        except BaseException:
+            self._all.discard(worker)
+            await worker.end()
+            raise
+        if worker.done >= RETIRES_AFTER:
+            self._all.discard(worker)
+            await worker.end()
+        else:
+            self._idle.append(worker)
+        return answer

@@ -1,0 +1,173 @@
+"""What a campaign's table says in numbers: shares with intervals, times, choices, estimates and J of every action."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coordinator.campaign.conduct import SESSIONS, TIMES, read_csv
+from coordinator.campaign.observed import observation
+from coordinator.campaign.plan import Plan
+from coordinator.campaign.rows import Row
+from coordinator.campaign.table import TABLE
+from coordinator.learning.estimate import Key, Tally, merge
+from coordinator.learning.intervals import wilson
+from coordinator.learning.objective import Comparison, Question, compare
+from coordinator.task import Task
+
+Tallies = dict[Key, Tally]
+SALT = "campaign"
+
+
+@dataclass
+class Counts:
+    """Throws of one regime, or of all."""
+
+    runs: int = 0
+    """Throws that were begun."""
+    not_begun: int = 0
+    """Throws for which the mission run was given up before."""
+    goals: int = 0
+    completed: int = 0
+    all_success: int = 0
+    times: list[float] = field(default_factory=list)
+    """s, of the completed ones."""
+
+    def add(self, row: Row) -> None:
+        """Count a throw."""
+        if row.throw is None:
+            self.not_begun += 1
+            return
+        self.runs += 1
+        self.goals += row.throw.goals > 0
+        self.completed += row.throw.completed
+        self.all_success += row.throw.all_success
+        if row.throw.completed and row.throw.time is not None:
+            self.times.append(row.throw.time)
+
+    def to_plain(self, has_goal: bool) -> dict[str, Any]:
+        """Plain data; R_goal of a task without goal transitions is none."""
+        met = self.goals if has_goal else self.completed
+        low, high = wilson(met, self.runs)
+        return {
+            "runs": self.runs,
+            "not_begun": self.not_begun,
+            "R_goal": _share(self.goals, self.runs) if has_goal else None,
+            "wilson": [round(low, 6), round(high, 6)],
+            "P_complete": _share(self.completed, self.runs),
+            "R_conj": _share(self.all_success, self.runs),
+            "mean": round(float(np.mean(self.times)), 6) if self.times else None,
+            "q90": round(float(np.quantile(self.times, 0.9)), 6) if self.times else None,
+        }
+
+
+def _share(part: int, whole: int) -> float | None:
+    return round(part / whole, 6) if whole else None
+
+
+def tallies_of(task: Task, rows: Iterable[Row], salt: str = SALT) -> Tallies:
+    """The estimates of all runs in these rows, by primitive task, action and regime."""
+    out: Tallies = {}
+    for row in rows:
+        for run in row.throw.runs if row.throw is not None else ():
+            key = Key(task.primitive_task_of(run.place).name, run.action, row.regime)
+            out[key] = out.get(key, Tally()).adding(observation(task, run), f"{salt}/{row.seed}/{row.k}")
+    return dict(sorted(out.items()))
+
+
+def comparisons(task: Task, tallies: Mapping[Key, Tally], regime: str | None = None) -> dict[str, Comparison]:
+    """By primitive task: all its alternatives with runs judged together, over all regimes or in one."""
+    out = {}
+    for primitive in task.primitive_tasks.values():
+        by_action: dict[str, dict[str, Tally]] = {}
+        for key, tally in tallies.items():
+            if key.primitive_task == primitive.name and regime in (None, key.context):
+                by_action.setdefault(key.action, {})[key.context] = tally
+        if by_action:
+            ordered = {a: by_action[a] for a in primitive.alternatives if a in by_action}
+            out[primitive.name] = compare(ordered, Question(primitive.cost))
+    return out
+
+
+@dataclass
+class Summary:
+    """Everything that is counted in one pass over the rows."""
+
+    task: Task
+    whole: Counts = field(default_factory=Counts)
+    by_regime: dict[str, Counts] = field(default_factory=dict)
+    chosen: dict[str, dict[str, int]] = field(default_factory=dict)
+    tallies: Tallies = field(default_factory=dict)
+    mission_s: dict[int, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, task: Task, rows: Iterable[Row]) -> Summary:
+        """Of a table's rows."""
+        made = cls(task)
+        for row in rows:
+            made.add(row)
+        return made
+
+    def add(self, row: Row) -> None:
+        """Count a row."""
+        self.whole.add(row)
+        self.by_regime.setdefault(row.regime, Counts()).add(row)
+        self.mission_s[row.block] = row.mission_s
+        for run in row.throw.runs if row.throw is not None else ():
+            primitive = self.task.primitive_task_of(run.place).name
+            actions = self.chosen.setdefault(primitive, {})
+            actions[run.action] = actions.get(run.action, 0) + 1
+        for key, tally in tallies_of(self.task, [row]).items():
+            self.tallies[key] = merge(self.tallies.get(key, Tally()), tally)
+
+    def objectives(self) -> dict[str, dict[str, float | None]]:
+        """J of each action, one rho for each primitive task."""
+        found = comparisons(self.task, self.tallies)
+        return {task: {f.action: _finite(f.j) for f in judged.figures} for task, judged in found.items()}
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain data."""
+        has_goal = bool(self.task.goal_transitions)
+        return {
+            **self.whole.to_plain(has_goal),
+            "by_regime": {name: counts.to_plain(has_goal) for name, counts in self.by_regime.items()},
+            "chosen": {t: dict(sorted(self.chosen[t].items())) for t in self.task.primitive_tasks if t in self.chosen},
+            "J": self.objectives(),
+            "sim_s": round(sum(self.mission_s.values()), 6),
+        }
+
+
+def result_of(folder: Path, plan: Plan, task: Task, rows: Iterable[Row], policy: Mapping[str, Any]) -> dict[str, Any]:
+    """The result of a campaign as the command line writes it."""
+    summary = Summary.of(task, rows).to_plain()
+    sessions, times = read_csv(folder / SESSIONS), read_csv(folder / TIMES)
+    wall = sum(float(s["wall_s"]) for s in sessions)
+    core_s = sum(float(s["wall_s"]) * int(s["workers"]) for s in sessions)
+    cpu = sum({int(t["block"]): float(t["cpu_s"]) for t in times}.values())
+    sim = summary["sim_s"]
+    return {
+        "task": task.name,
+        "regimes": list(plan.regimes),
+        "seed": plan.seed,
+        "selector": plan.selector,
+        "workers": int(sessions[-1]["workers"]) if sessions else 0,
+        "rows": str(folder / TABLE),
+        **summary,
+        "runs": plan.runs,
+        "begun": summary["runs"],
+        "policy": dict(policy),
+        "lost_workers": sum(int(s["lost"]) for s in sessions),
+        "wall_s": round(wall, 3),
+        "cpu_s": round(cpu, 3),
+        "times_real_time_per_core": round(sim / core_s, 3) if core_s else None,
+        "times_real_time_per_cpu_s": round(sim / cpu, 3) if cpu else None,
+    }
+
+
+def _finite(value: float) -> float | None:
+    return round(value, 6) if math.isfinite(value) else None

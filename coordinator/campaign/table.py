@@ -1,0 +1,103 @@
+"""A campaign's table on disk: one CSV file that only ever grows by whole blocks, in order, so an interrupted one goes on."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import io
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from coordinator.campaign.plan import Block, CampaignError
+from coordinator.campaign.rows import Row, cells, columns, read_row
+from coordinator.task import Task
+
+TABLE = "table.csv"
+PARQUET = "table.parquet"
+
+
+class Table:
+    """The table of a task's campaign in a folder."""
+
+    def __init__(self, folder: Path, task: Task) -> None:
+        self.path = folder / TABLE
+        self._task = task
+        self._columns: list[str] | None = None
+
+    def recover(self, blocks: Sequence[Block]) -> int:
+        """Cut off what an interruption left of a block; gives how many blocks are complete. Raises CampaignError."""
+        if not self.path.exists():
+            return 0
+        text = self.path.read_bytes()
+        ends = _record_ends(text)
+        if not ends:
+            self.path.unlink()
+            return 0
+        self._columns = next(csv.reader(io.StringIO(text[: ends[0]].decode("utf-8"))))
+        throws, done, end = len(ends) - 1, 0, ends[0]
+        for block in blocks:
+            if block.first + block.count > throws:
+                break
+            done, end = done + 1, ends[block.first + block.count]
+        if end < len(text):
+            with self.path.open("r+b") as file:
+                file.truncate(end)
+        return done
+
+    def append(self, rows: Sequence[Row]) -> None:
+        """Add a block's rows; they are on disk when this returns."""
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        if self._columns is None:
+            self._columns = columns(self._task, rows)
+            writer.writerow(self._columns)
+        for row in rows:
+            writer.writerow(cells(self._task, row, self._columns))
+        with self.path.open("ab") as file:
+            file.write(out.getvalue().encode("utf-8"))
+            file.flush()
+            os.fsync(file.fileno())
+
+    def rows(self) -> Iterator[Row]:
+        """All rows, one after the other."""
+        return read_table(self.path) if self.path.exists() else iter(())
+
+
+def read_table(path: Path) -> Iterator[Row]:
+    """The rows of a table. Raises CampaignError naming the line that is none."""
+    csv.field_size_limit(1 << 26)
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            for number, record in enumerate(csv.DictReader(file), 2):
+                try:
+                    yield read_row(record)
+                except (KeyError, ValueError, TypeError) as fault:
+                    raise CampaignError(f"{path}: line {number} is no row of a campaign: {fault!r}") from fault
+    except OSError as fault:
+        raise CampaignError(f"{path}: {fault.strerror or fault}") from fault
+
+
+def _record_ends(text: bytes) -> list[int]:
+    """Where each complete record ends: after a newline that stands outside quotes."""
+    ends, quoted, start = [], False, 0
+    while (at := text.find(b"\n", start)) >= 0:
+        quoted ^= text.count(b'"', start, at) % 2 == 1
+        start = at + 1
+        if not quoted:
+            ends.append(start)
+    return ends
+
+
+def write_parquet(folder: Path) -> Path | None:
+    """The table as Parquet beside the CSV file if pyarrow is installed, else None."""
+    try:
+        arrow_csv: Any = importlib.import_module("pyarrow.csv")
+        parquet: Any = importlib.import_module("pyarrow.parquet")
+    except ImportError:
+        return None
+    target = folder / PARQUET
+    options = arrow_csv.ParseOptions(newlines_in_values=True)
+    parquet.write_table(arrow_csv.read_csv(folder / TABLE, parse_options=options), target)
+    return target

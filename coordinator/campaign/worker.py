@@ -1,0 +1,50 @@
+"""A campaign's worker process: blocks in on standard input, results out on standard output, one JSON text a line.
+
+The first line is the plan. Whatever else writes to standard output (drivers do) goes to standard error.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any, TextIO
+
+from coordinator.campaign.block import Bench, run_block
+from coordinator.campaign.plan import Block, CampaignError, Plan
+
+
+@lru_cache(maxsize=1)
+def _bench(plan: str) -> Bench:
+    return Bench.of(Plan.from_plain(json.loads(plan)))
+
+
+def answer(plan: str, order: Mapping[str, Any]) -> dict[str, Any]:
+    """Run the block that `order` holds (`block`, `weights`); `plan` as JSON. A fault of the campaign's comes as `fault`."""
+    try:
+        return run_block(_bench(plan), Block(**order["block"]), order["weights"]) | {"pid": os.getpid()}
+    except CampaignError as fault:
+        return {"index": order["block"]["index"], "fault": str(fault)}
+
+
+def serve(orders: TextIO, answers: TextIO) -> None:
+    """Answer each order until there is none."""
+    plan = orders.readline()
+    for line in orders:
+        print(json.dumps(answer(plan, json.loads(line))), file=answers, flush=True)
+
+
+def main() -> None:
+    """Keep the way to the parent for answers alone."""
+    with os.fdopen(os.dup(1), "w", encoding="utf-8") as answers:
+        os.dup2(2, 1)
+        try:
+            serve(sys.stdin, answers)
+        except KeyboardInterrupt:
+            sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,186 @@
+"""Run a task many times in parallel lock-step cells, learn if asked to, and leave one table with a row for each run."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from coordinator.cli import CommandError
+from coordinator.cli.loading import add_services_argument, load_task, services_path, task_path, write_json
+
+if TYPE_CHECKING:
+    from coordinator.campaign.conduct import Campaign
+    from coordinator.campaign.plan import Plan
+    from coordinator.task import Task
+
+EXAMPLE = "petrobot campaign catch_ball --runs 200 --regime A,B --selector nikolic_fu --workers 2 --json out.json"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument("task", help="a task file, or the name of a task that comes with petrobot")
+    parser.add_argument(
+        "--runs", type=_positive, default=100, metavar="N", help="in all regimes together (%(default)s)"
+    )
+    parser.add_argument(
+        "--regime", default="", metavar="A,B", help="regimes that take turns, with the same seeds in each"
+    )
+    parser.add_argument(
+        "--selector", default="fixed", metavar="NAME", help="fixed, round_robin, random, or one that learns"
+    )
+    parser.add_argument("--choose", default="", metavar="TASK=ACTION,...", help="actions chosen by hand")
+    parser.add_argument(
+        "--learned", metavar="CAMPAIGN", type=Path, help="the best actions that this campaign has learned"
+    )
+    parser.add_argument("--target", type=float, metavar="R", help="learn among actions that reach this reliability")
+    parser.add_argument("--rho", type=float, metavar="X", help="weight of cost when learning (1 / largest mean cost)")
+    parser.add_argument(
+        "--workers", type=_positive, default=os.cpu_count() or 1, metavar="K", help="processes (%(default)s)"
+    )
+    parser.add_argument(
+        "--cluster", metavar="ADDRESS", help="workers of this dask scheduler instead, as tcp://host:8786"
+    )
+    parser.add_argument("--seed", type=int, default=1, metavar="S", help="of all chance (%(default)s)")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the task")
+    parser.add_argument("--block", type=_positive, default=5, metavar="N", help="throws in one cell (%(default)s)")
+    parser.add_argument(
+        "--batch",
+        type=_positive,
+        default=20,
+        metavar="N",
+        help="runs between two updates of what is learned (%(default)s)",
+    )
+    parser.add_argument("--mock", metavar="FILE", type=Path, help="replace actions by scripted ones")
+    parser.add_argument(
+        "--out", metavar="FOLDER", type=Path, help="where table and estimates go (campaigns/TASK-SELECTOR-S)"
+    )
+    parser.add_argument(
+        "--resume", metavar="FOLDER", type=Path, help="go on with this one; the same as giving its --out again"
+    )
+    parser.add_argument("--check", metavar="FORECAST", type=Path, help="compare the result with a registered forecast")
+    parser.add_argument("--json", metavar="FILE", help="write the result as JSON (- for standard output)")
+    parser.add_argument("--quiet", action="store_true", help="no progress in the terminal")
+    add_services_argument(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run or resume the campaign; print and write its result."""
+    from coordinator.campaign.conduct import Campaign
+    from coordinator.campaign.plan import CampaignError, read_manifest
+    from coordinator.campaign.progress import ProgressLine
+
+    shown = ProgressLine(sys.stderr)
+    shown.wanted = shown.wanted and not options.quiet
+    try:
+        if options.resume is not None:
+            folder, plan = options.resume, read_manifest(options.resume)
+        else:
+            plan = _plan(options, load_task(options.task))
+            folder = options.out or Path("campaigns") / f"{Path(plan.task).stem}-{plan.selector}-{plan.seed}"
+        campaign = Campaign(folder, plan, shown)
+        try:
+            asyncio.run(_conduct(campaign, options))
+        finally:
+            shown.close()
+        result = campaign.result()
+    except CampaignError as fault:
+        raise CommandError(2, str(fault)) from fault
+    write_json(str(folder / "result.json"), result)
+    if options.json:
+        write_json(options.json, result)
+    if options.json != "-":
+        print(text_of(result))
+    return 0
+
+
+async def _conduct(campaign: Campaign, options: argparse.Namespace) -> None:
+    from coordinator.campaign.cluster import ClusterPool
+    from coordinator.campaign.pool import LocalPool
+
+    if options.cluster:
+        async with ClusterPool(campaign.plan, options.cluster) as cluster:
+            await campaign.run(cluster)
+    else:
+        async with LocalPool(campaign.plan, options.workers, campaign.folder / "workers.log") as pool:
+            await campaign.run(pool)
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not at least 1")
+    return value
+
+
+def _plan(options: argparse.Namespace, task: Task) -> Plan:
+    from coordinator.campaign.plan import Plan, digest
+    from coordinator.campaign.policies import learns
+    from coordinator.cli.parameters import parameter_of
+
+    if options.seed < 0:
+        raise CommandError(2, f"--seed {options.seed}: give 0 or more")
+    given = dict(_pair("--set", text) for text in options.set)
+    regimes = tuple(name for name in options.regime.split(",") if name) or (str(task.parameters.get("regime", "")),)
+    if regimes != ("",) and "regime" not in task.parameters:
+        raise CommandError(2, f"--regime {options.regime}: {task.name} has no parameter regime")
+    if len(set(regimes)) < len(regimes):
+        raise CommandError(2, f"--regime {options.regime}: name each regime once")
+    chosen = dict(_pair("--choose", text) for text in options.choose.split(",") if text)
+    paths = {"task": str(task_path(options.task)), "services": str(services_path(options.services))}
+    paths |= {"mock": str(options.mock)} if options.mock else {}
+    return Plan(
+        **{key: str(Path(path).resolve()) for key, path in paths.items()},
+        runs=options.runs,
+        regimes=regimes,
+        seed=options.seed,
+        selector=options.selector,
+        chosen=chosen,
+        parameters={name: parameter_of(task, name, text) for name, text in given.items()},
+        block=options.block if task.runs_place else 1,
+        batch=options.batch if learns(options.selector) else 0,
+        options=_selector_options(options),
+        digests={key: digest(path) for key, path in paths.items()},
+    )
+
+
+def _selector_options(options: argparse.Namespace) -> dict[str, Any]:
+    from coordinator.campaign.policies import learned_choices
+
+    found: dict[str, Any] = {name: value for name in ("target", "rho") if (value := getattr(options, name)) is not None}
+    if options.learned is not None:
+        if options.selector != "fixed":
+            raise CommandError(2, f"--learned chooses what was learned; leave --selector {options.selector} out")
+        found["by_regime"] = learned_choices(options.learned)
+    return found
+
+
+def _pair(option: str, text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not equals:
+        raise CommandError(2, f"{option} {text}: write NAME=VALUE")
+    return name, value
+
+
+def text_of(result: dict[str, Any]) -> str:
+    """The result for people."""
+    lines = [f"{result['task']}: {result['begun']} runs, selector {result['selector']}, seed {result['seed']}"]
+    for name, part in [*result["by_regime"].items(), ("all", result)]:
+        low, high = part["wilson"]
+        goal = "" if part["R_goal"] is None else f"R_goal {part['R_goal']:.4f} [{low:.4f}, {high:.4f}]  "
+        times = "" if part["mean"] is None else f"  mean {part['mean']:.3f} s, 90 % {part['q90']:.3f} s"
+        lines.append(f"  {name or '-':16}{goal}P_complete {part['P_complete'] or 0.0:.4f}{times}")
+    for task, actions in result["chosen"].items():
+        if len(actions) > 1:
+            judged = result["J"].get(task, {})
+            shown = ", ".join(
+                f"{a} {n}" + (f" (J {judged[a]:.3f})" if judged.get(a) is not None else "") for a, n in actions.items()
+            )
+            lines.append(f"  {task:16}{shown}")
+    speed = result["times_real_time_per_core"]
+    lines.append(f"  {result['sim_s']:.1f} s simulated in {result['wall_s']:.1f} s: {speed} x real time a core")
+    lines.append(f"  table: {result['rows']}")
+    return "\n".join(lines)

@@ -1,0 +1,26 @@
+"""Parameters of a task as users write them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from coordinator.cli import CommandError
+
+if TYPE_CHECKING:
+    from coordinator.task import Task
+
+
+def parameter_of(task: Task, name: str, text: str) -> Any:
+    """The value of a parameter from its text, of the same type as its default. Raises CommandError."""
+    if name not in task.parameters:
+        known = ", ".join(task.parameters) or "none"
+        raise CommandError(2, f"{task.name} has no parameter {name!r}; it has: {known}")
+    default = task.parameters[name]
+    if isinstance(default, bool):
+        if text not in ("true", "false"):
+            raise CommandError(2, f"parameter {name}: {text!r} is neither true nor false")
+        return text == "true"
+    try:
+        return type(default)(text) if isinstance(default, int | float) else text
+    except ValueError as fault:
+        raise CommandError(2, f"parameter {name}: {text!r} is no {type(default).__name__}") from fault

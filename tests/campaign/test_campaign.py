@@ -1,0 +1,194 @@
+"""A campaign's table: the same whoever does the blocks, however many do, and however often it is interrupted."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from coordinator.campaign.conduct import Campaign, Progress
+from coordinator.campaign.plan import CampaignError, Plan
+from coordinator.campaign.pool import LocalPool
+from coordinator.campaign.table import TABLE, read_table
+from coordinator.launch import Setting, lockstep_cell
+from tests.campaign.conftest import Conduct
+
+
+def table(folder: Path) -> bytes:
+    """The table's bytes."""
+    return (folder / TABLE).read_bytes()
+
+
+def test_blocks_cover_all_throws_whatever_their_size(toy_plan: Plan) -> None:
+    """Regimes take turns and share their seeds; numbers and seeds come from the index alone."""
+    from dataclasses import replace
+
+    for runs, block in ((1, 4), (7, 3), (12, 5), (20, 1)):
+        blocks = replace(toy_plan, runs=runs, block=block).blocks
+        assert [b.index for b in blocks] == list(range(len(blocks)))
+        assert sum(b.count for b in blocks) == runs
+        assert [b.first for b in blocks] == [sum(a.count for a in blocks[:i]) for i in range(len(blocks))]
+        for regime in ("easy", "rough"):
+            own = [b for b in blocks if b.regime == regime]
+            assert [b.seed for b in own] == [1_000_000 + i for i in range(len(own))]
+    longer = replace(toy_plan, runs=24).blocks
+    assert [b.seed for b in longer][:4] == [b.seed for b in toy_plan.blocks][:4]
+
+
+def test_columns_come_from_task_and_score(conduct: Conduct) -> None:
+    """One row a throw, with what the toy's own score says and what each run did."""
+    campaign = conduct("a")
+    rows = list(campaign.table.rows())
+    assert [row.n for row in rows] == list(range(1, 13))
+    assert {row.regime for row in rows} == {"easy", "rough"}
+    header = table(campaign.folder).split(b"\n")[0].decode().split(",")
+    assert {"n", "regime", "seed", "chosen.look", "look.status", "look.cost", "parts.x", "parts.gripped"} <= set(header)
+    for row in rows:
+        assert row.throw is not None
+        assert row.throw.runs[0].place == "look"
+        assert row.score["parts.n"] == row.k
+        grips = [run for run in row.throw.runs if run.place == "grip"]
+        assert all(run.cost == 1.0 for run in grips)  # grip_soft costs its force
+        assert row.throw.goals == sum(run.taken == "gripped" for run in row.throw.runs)
+        assert row.throw.time is not None and row.throw.time >= sum(run.took for run in row.throw.runs) - 1e-6
+
+
+def test_a_block_is_the_mission_run_that_petrobot_run_gives(conduct: Conduct) -> None:
+    """Seed and number of a row are enough to repeat it alone."""
+    campaign = conduct("a")
+    block = campaign.plan.blocks[2]
+    setting = Setting(campaign.bench.task, {"regime": block.regime}, block.count, block.seed)
+    cell, party = lockstep_cell(campaign.bench.directory, setting)
+    assert cell.run(lambda: party.over, 100_000)
+    rows = [row for row in campaign.table.rows() if row.block == block.index]
+    in_table = [run.seconds for row in rows for run in (row.throw.runs if row.throw else ())]
+    assert [run.seconds for run in party.mission.tally.runs] == pytest.approx(in_table)
+    assert rows[0].mission_s == pytest.approx(party.mission.ended - party.mission.begun)
+
+
+def test_another_seed_gives_another_table(conduct: Conduct) -> None:
+    """And the same seed the same one."""
+    assert table(conduct("a").folder) == table(conduct("b").folder)
+    assert table(conduct("a").folder) != table(conduct("c", seed=2).folder)
+
+
+@pytest.mark.parametrize("fails_at", [0, 1, 3])
+def test_interrupted_and_resumed_gives_the_same_table(conduct: Conduct, fails_at: int) -> None:
+    """Between blocks, and in the middle of writing one."""
+    whole = conduct("whole")
+    with pytest.raises(KeyboardInterrupt):
+        conduct("part", fails_at=fails_at)
+    path = whole.folder.parent / "part" / TABLE
+    if path.exists():
+        cut = path.read_bytes()
+        path.write_bytes(cut + b'99,easy,"half a r')
+    resumed = conduct("part")
+    assert table(resumed.folder) == table(whole.folder)
+    assert resumed.result()["sim_s"] == whole.result()["sim_s"]
+
+
+@pytest.mark.parametrize("kept", [1, 40, 400, 1500])
+def test_a_table_cut_anywhere_is_recovered(conduct: Conduct, kept: int) -> None:
+    """Whatever the disk kept of it."""
+    whole, other = conduct("whole"), conduct("other")
+    (other.folder / TABLE).write_bytes(table(other.folder)[:-kept])
+    assert table(conduct("other").folder) == table(whole.folder)
+
+
+def test_another_campaign_in_the_same_folder_is_refused(conduct: Conduct) -> None:
+    """With the keys that differ."""
+    conduct("a")
+    with pytest.raises(CampaignError, match="seed, selector differ"):
+        conduct("a", seed=5, selector="random")
+
+
+def test_files_that_changed_are_refused(conduct: Conduct, tmp_path: Path) -> None:
+    """A table is of one task file."""
+    with pytest.raises(CampaignError, match="has changed"):
+        conduct("a", digests={"task": "0" * 64})
+
+
+def test_a_bad_regime_is_the_campaigns_fault(conduct: Conduct) -> None:
+    """The cell's own words, with the seed."""
+    with pytest.raises(CampaignError, match="no regime 'steep'"):
+        conduct("a", regimes=("steep",))
+
+
+def test_round_robin_tries_every_combination(conduct: Conduct) -> None:
+    """Three ways to look times two to grip, in each regime."""
+    rows = list(conduct("a", selector="round_robin", runs=24).table.rows())
+    easy = [row.throw for row in rows if row.regime == "easy"]
+    seen = {tuple(run.action for run in t.runs if run.place in ("look", "grip")) for t in easy if t and len(t.runs) > 1}
+    assert {combination[0] for combination in seen} == {"look_quick", "look_twice", "look_long"}
+    assert len(seen) >= 5  # one of six may have been unseen
+
+
+def test_progress_counts_throws(tmp_path: Path, toy_plan: Plan) -> None:
+    """Up to the last one; a resumed campaign says how many it found."""
+    from tests.campaign.conftest import InlinePool
+
+    seen: list[Progress] = []
+    campaign = Campaign(tmp_path / "a", toy_plan, seen.append)
+    asyncio.run(campaign.run(InlinePool(toy_plan)))
+    assert [p.done for p in seen] == [3, 6, 9, 12]
+    assert all(p.of == 12 and p.already == 0 for p in seen)
+
+
+@pytest.mark.processes
+def test_workers_in_any_number_and_a_killed_one_change_nothing(
+    conduct: Conduct, tmp_path: Path, toy_plan: Plan
+) -> None:
+    """kill -9 of a busy worker: its block is done again by another one."""
+    alone = conduct("alone", selector="random")
+    plan = alone.plan
+
+    async def with_workers(name: str, count: int, kill: bool) -> LocalPool:
+        campaign = Campaign(tmp_path / name, plan)
+        async with LocalPool(plan, count, campaign.folder / "workers.log") as pool:
+            going = asyncio.create_task(campaign.run(pool))
+            if kill:
+                while not pool.pids:
+                    await asyncio.sleep(0)
+                os.kill(pool.pids[0], signal.SIGKILL)
+            await going
+            return pool
+
+    for count, kill in ((1, False), (3, True)):
+        pool = asyncio.run(with_workers(f"by_{count}", count, kill))
+        assert pool.lost == kill
+        assert table(tmp_path / f"by_{count}") == table(alone.folder)
+    assert len(list(read_table(tmp_path / "by_3" / TABLE))) == 12
+
+
+def test_learning_depends_on_batches_alone(conduct: Conduct) -> None:
+    """Interrupted in the middle of a batch and resumed, it chooses and learns the same."""
+    learning = {"selector": "nikolic_fu_fast", "runs": 60, "batch": 12, "options": {"rho": 0.1}}
+    whole = conduct("whole", **learning)
+    for fails_at in (6, 8, 11):
+        with pytest.raises(KeyboardInterrupt):
+            conduct(f"part{fails_at}", fails_at=fails_at, **learning)
+        resumed = conduct(f"part{fails_at}", **learning)
+        assert table(resumed.folder) == table(whole.folder)
+        assert resumed.policy.state() == whole.policy.state()
+    looks = [row.throw.runs[0].action for row in whole.table.rows() if row.throw and row.regime == "easy"]
+    assert set(looks[:15]) == {"look_quick", "look_twice", "look_long"}  # first trials of each
+
+
+def test_what_was_learned_can_be_judged_afresh(conduct: Conduct) -> None:
+    """By regime, from the result of the campaign that learned."""
+    import json
+
+    from coordinator.campaign.policies import learned_choices
+
+    learnt = conduct("learnt", selector="thompson", runs=60, batch=12)
+    (learnt.folder / "result.json").write_text(json.dumps(learnt.result()), encoding="utf-8")
+    best = learned_choices(learnt.folder)
+    assert set(best) == {"easy", "rough"}
+    judged = conduct("judged", seed=2, options={"by_regime": best})
+    for row in judged.table.rows():
+        for run in row.throw.runs if row.throw else ():
+            if run.place in best[row.regime]:
+                assert run.action == best[row.regime][run.place]
