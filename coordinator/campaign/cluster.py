@@ -10,6 +10,8 @@ from typing import Any
 from coordinator.campaign.plan import CampaignError, Plan
 from coordinator.campaign.worker import answer
 
+PATIENCE = 30.0
+"""s in which a first worker has to be there."""
 RETRIES = 5
 """Times that a block whose worker was lost is given to another one."""
 
@@ -41,9 +43,16 @@ class ClusterPool:
             self._client = await distributed.Client(self._address, asynchronous=True, timeout=10)
         except (OSError, TimeoutError, ValueError) as fault:
             raise CampaignError(f"--cluster {self._address}: no scheduler answers: {fault}") from fault
-        workers = self._client.scheduler_info(n_workers=-1)["workers"]
-        self.count = max(1, sum(worker["nthreads"] for worker in workers.values()))
+        await self.workers(1, PATIENCE)
         return self
+
+    async def workers(self, least: int, patience: float) -> None:
+        """Wait until so many workers are there, and count them. Raises CampaignError after `patience` s."""
+        try:
+            await self._client.wait_for_workers(least, timeout=patience)
+        except TimeoutError as fault:
+            raise CampaignError(f"--cluster {self._address}: fewer than {least} workers in {patience:g} s") from fault
+        self.count = sum((await self._client.nthreads()).values())
 
     async def __aexit__(self, *_: object) -> None:
         await self._client.close()
