@@ -7,23 +7,20 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, Protocol
 
 from services.comm.canbus import Frame
-from services.comm.canopen import SYNC_ID, Abort, NmtState, SdoAbortError
+from services.comm.canopen import SYNC_ID
 from services.comm.cia402 import (
     UNITS,
-    Command,
     Fault,
     Mode,
     Object,
     State,
     StatusBit,
-    after,
-    command_of,
     fault_text,
-    from_units,
     to_units,
 )
 from sim.canopen_node import CanopenNode
 from sim.digital_io import DigitalInputs
+from sim.power_drive import POWERED, PowerDrive
 from sim.servo import DriveRating, JointServo
 
 INPUTS_NODE: Final = 7
@@ -33,25 +30,15 @@ SYNC_PATIENCE: Final = 10
 """Periods of 1006h without SYNC after which an enabled drive stops by itself: 40 ms at 250 Hz, shorter than three periods of
 the set-point stream, longer than what a master on an ordinary Linux is now and then late."""
 
-_REGISTERS: Final = {
-    Fault.OVERCURRENT: 0x03, Fault.UNDERVOLTAGE: 0x05, Fault.OVERHEATED: 0x09,
-    Fault.HEARTBEAT: 0x11, Fault.SYNC_LOST: 0x11, Fault.CAN_PASSIVE: 0x11, Fault.BUS_OFF_RECOVERED: 0x11,
-}  # fmt: skip
-_POWERLESS: Final = (Fault.OVERCURRENT, Fault.UNDERVOLTAGE, Fault.ENCODER)
-"""Faults after which a drive cannot brake by its motor: the brake takes over at once."""
-_STATUSWORD, _CONTROLWORD = (int(Object.STATUSWORD), 0), (int(Object.CONTROLWORD), 0)
+_STATUSWORD: Final = (int(Object.STATUSWORD), 0)
 _POSITION, _VELOCITY, _TORQUE, _TARGET = (
     (int(Object.POSITION), 0),
     (int(Object.VELOCITY), 0),
     (int(Object.TORQUE), 0),
     (int(Object.TARGET_POSITION), 0),
 )
-_POWERED: Final = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
-_DOWN: Final = (State.FAULT, State.FAULT_REACTION_ACTIVE)
 _ENABLED: Final = State.OPERATION_ENABLED
-_REMOTE, _VOLTAGE = int(StatusBit.REMOTE), int(StatusBit.VOLTAGE_ENABLED)
-_FOLLOWS, _LIMIT, _ERROR = int(StatusBit.FOLLOWS_COMMAND), int(StatusBit.INTERNAL_LIMIT), int(StatusBit.FOLLOWING_ERROR)
-_ENABLE_MASK, _ENABLE = Command.ENABLE_OPERATION.value
+_LIMIT, _ERROR = int(StatusBit.INTERNAL_LIMIT), int(StatusBit.FOLLOWING_ERROR)
 
 
 class Plant(Protocol):
@@ -86,39 +73,25 @@ def ratings(table: Mapping[str, Any]) -> tuple[DriveRating, ...]:
     )
 
 
-class Drive(CanopenNode):
-    """One drive: CiA 402 state machine in cyclic synchronous position mode around a `JointServo`."""
+class Drive(PowerDrive):
+    """One joint's drive: cyclic synchronous position mode around a `JointServo`."""
+
+    mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
+    fixed = (Object.MODE, Object.INTERPOLATION_PERIOD, Object.SOFTWARE_LIMITS)
 
     def __init__(self, joint: int, rating: DriveRating, plant: Plant, stir: Callable[[], None]) -> None:
         """`stir` is called whenever something happens that may change the torque of a joint at rest."""
-        super().__init__(joint + 1, "joint_drive.eds")
+        super().__init__(joint + 1, "joint_drive.eds", SYNC_PATIENCE, stir)
         self.joint = joint
         self.plant = plant
-        self._stir = stir
         self._shown: tuple[int, float, float, float] | None = None
         self.servo = JointServo(rating, plant.q[joint])
-        self.state = State.NOT_READY_TO_SWITCH_ON
-        self.powered = True
-        self.fault = Fault.NONE
         self._speed_factor = 1.0
         self._torque = 0.0
-        self._controlword = 0
-        self._synced = 0.0
         self._error_since: float | None = None
         self.after_configuring()
 
     # Hooks of the CANopen node.
-    def on_nmt(self, now: float, before: NmtState) -> None:
-        """A reset starts the state machine anew; leaving OPERATIONAL while enabled stops the motion (6007h = 2)."""
-        if before is NmtState.BOOT_UP:
-            if self.state not in _DOWN:
-                self._enter(State.SWITCH_ON_DISABLED)
-        elif before is NmtState.OPERATIONAL and self.state is State.OPERATION_ENABLED:
-            self._quick_stop(State.QUICK_STOP_ACTIVE)
-        self._synced = now
-        self._shown = None
-        self._refresh()
-
     def before_sending(self) -> None:
         """Bring status, position, speed and torque up to date."""
         plant, joint = self.plant, self.joint
@@ -140,81 +113,66 @@ class Drive(CanopenNode):
         self.values[Object.ERROR_CODE, 0] = self.fault
         self.values[Object.MODE_DISPLAY, 0] = self.values[Object.MODE, 0]
 
-    def after_receiving(self, now: float) -> None:
-        """Obey the controlword; take over what configuration changes."""
-        word = self.values[_CONTROLWORD]
-        before, self._controlword = self._controlword, word
-        if word & _ENABLE_MASK == _ENABLE and self.state is _ENABLED:
-            return  # nothing new
-        command = command_of(word)
-        if command is Command.FAULT_RESET and before & 0x80:
-            return
-        if command is not None:
-            self._obey(now, command)
-
     def on_sync(self, now: float) -> None:
         """A new set point is due."""
         self._synced = now
         if self.state is _ENABLED:
             self.servo.aim(self._target())
             if not self.servo.standing:
-                self._stir()
-
-    def on_master_lost(self, now: float) -> None:
-        """Stop by itself."""
-        self.trip(Fault.HEARTBEAT)
+                self.stir()
 
     def after_configuring(self) -> None:
         """Take over how the drive watches itself."""
+        super().after_configuring()
         values = self.values
         self._window = values[Object.FOLLOWING_ERROR_WINDOW, 0] / UNITS
         self._patience = values[Object.FOLLOWING_ERROR_TIMEOUT, 0] * 1e-3
-        self._sync_patience = SYNC_PATIENCE * values[Object.SYNC_PERIOD, 0] * 1e-6 or math.inf
         self._range = values[Object.SOFTWARE_LIMITS, 1], values[Object.SOFTWARE_LIMITS, 2]
         if values[Object.INTERPOLATION_PERIOD, 1]:
             self.servo.period = values[Object.INTERPOLATION_PERIOD, 1] * 10.0 ** values[Object.INTERPOLATION_PERIOD, 2]
-        self._stir()
+        self.stir()
 
-    def check_write(self, index: int, sub: int, value: int) -> None:
-        """No other mode than cyclic synchronous position, and no change of configuration while the motor has torque."""
-        if index == Object.MODE and value not in (Mode.NONE, Mode.CYCLIC_SYNCHRONOUS_POSITION):
-            raise SdoAbortError(Abort.VALUE, index, sub)
-        fixed = (Object.MODE, Object.INTERPOLATION_PERIOD, Object.SOFTWARE_LIMITS)
-        if index in fixed and self.state in _POWERED:
-            raise SdoAbortError(Abort.STATE, index, sub)
+    # Hooks of the state machine.
+    def begin(self, resumed: bool) -> None:
+        """Hold here, or take set points again from where the ramp has come to."""
+        if resumed:
+            self.servo.follow(self._target())
+        else:
+            self.servo.start(self.plant.q[self.joint])
+        self._error_since = None
+        self.plant.release(self.joint)
+
+    def ramp_down(self, deceleration: float) -> None:
+        """Bring the joint to rest."""
+        self.servo.ramp_down(deceleration)
+
+    def cut_power(self) -> None:
+        """The brake holds."""
+        self._torque = 0.0
+        self.plant.brake(self.joint)
+
+    def flags(self) -> int:
+        """Whether set points are cut, and whether the joint is too far off."""
+        limit = _LIMIT if self.servo.limited else 0
+        return limit | _ERROR if self._error_since is not None else limit
+
+    def refresh(self) -> None:
+        """Show everything anew, the greatest speed too."""
+        self._shown = None
+        self.servo.limit = self.servo.rating.speed * self._speed_factor
+        self.values[Object.MAX_SPEED, 0] = to_units(self.servo.limit)
+        self.stir()
 
     # What the laboratory does to a drive.
-    def trip(self, fault: Fault) -> None:
-        """A fault occurs: EMCY, then a ramp to rest (the brake at once if there is no power for it), then FAULT."""
-        if self.state in _DOWN:
-            return
-        self.fault = fault
-        self.report(fault, _REGISTERS.get(fault, 0x21))
-        if self.state not in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE) or fault in _POWERLESS:
-            self._enter(State.FAULT)
-        else:
-            self._quick_stop(State.FAULT_REACTION_ACTIVE)
-
     def slow_down(self, factor: float) -> None:
         """Give a share of the rated speed from now on; object 607Fh tells."""
         self._speed_factor = factor
-        self._refresh()
-
-    def statusword(self) -> int:
-        """Object 6041h."""
-        word: int = self.state.word | _REMOTE
-        if self.powered:
-            word |= _VOLTAGE
-        if self.state is _ENABLED:
-            word |= _FOLLOWS
-            word |= _LIMIT if self.servo.limited else 0
-            word |= _ERROR if self._error_since is not None else 0
-        return word
+        self.refresh()
 
     def torque(self, now: float, dt: float, q: float, qd: float) -> float:
         """Torque of the next `dt` seconds (N m) from the joint's angle and speed; 0 without power."""
         state = self.state
-        if state is not _ENABLED and state not in _POWERED:
+        if state is not _ENABLED and state not in POWERED:
             return 0.0
         servo = self.servo
         self._torque = tau = servo.torque(q, qd, dt)
@@ -223,20 +181,15 @@ class Drive(CanopenNode):
             if late or self._error_since is not None or not -self._window <= servo.error <= self._window:
                 self._watch(now, late)
         elif state is State.FAULT_REACTION_ACTIVE and servo.ramped_down and abs(qd) < 0.02:
-            self._enter(State.FAULT)
+            self.ramp_ended()
         return tau
 
     @property
     def settled(self) -> bool:
         """Whether the torque of a joint at rest stays as it is unless something happens."""
-        if self.state not in _POWERED:
+        if self.state not in POWERED:
             return True
         return self.servo.settled and self._error_since is None and self.state is not State.FAULT_REACTION_ACTIVE
-
-    @property
-    def waits_until(self) -> float:
-        """When the drive misses SYNC (s)."""
-        return self._synced + self._sync_patience if self.state is _ENABLED else math.inf
 
     def _watch(self, now: float, late: bool) -> None:
         """Following error (6065h, 6066h) and loss of SYNC (1006h)."""
@@ -253,52 +206,6 @@ class Drive(CanopenNode):
         """Object 607Ah within the software limits 607Dh, in rad."""
         (low, high), target = self._range, self.values[_TARGET]
         return (low if target < low else high if target > high else target) / UNITS
-
-    def _obey(self, now: float, command: Command) -> None:
-        state = after(self.state, command)
-        if state is self.state:
-            return
-        if self.state is State.FAULT:
-            if not self.powered:
-                return  # the cause is still there
-            self.fault = Fault.NONE
-            self.report(Fault.NONE, 0)
-        if state is State.OPERATION_ENABLED:
-            if self.nmt is not NmtState.OPERATIONAL or self.values[Object.MODE, 0] != Mode.CYCLIC_SYNCHRONOUS_POSITION:
-                return
-            self._enable(now)
-        elif state is State.QUICK_STOP_ACTIVE:
-            self._quick_stop(state)
-        else:
-            self._enter(state)
-
-    def _enable(self, now: float) -> None:
-        if self.state is State.QUICK_STOP_ACTIVE:
-            self.servo.follow(self._target())
-        else:
-            self.servo.start(self.plant.q[self.joint])
-        self._synced = now
-        self._error_since = None
-        self.plant.release(self.joint)
-        self.state = State.OPERATION_ENABLED
-        self._stir()
-
-    def _quick_stop(self, state: State) -> None:
-        self.servo.ramp_down(from_units(self.values[Object.QUICK_STOP_DECELERATION, 0]))
-        self.state = state
-        self._stir()
-
-    def _enter(self, state: State) -> None:
-        """A state without torque: the brake holds."""
-        self._torque = 0.0
-        self.plant.brake(self.joint)
-        self.state = state
-        self._stir()
-
-    def _refresh(self) -> None:
-        self.servo.limit = self.servo.rating.speed * self._speed_factor
-        self.values[Object.MAX_SPEED, 0] = to_units(self.servo.limit)
-        self._stir()
 
 
 class DriveBus:

@@ -19,54 +19,72 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from services.comm.canbus import Frame
 
-LASTING = ("drop_images", "dead_camera", "can_errors", "bus_off", "arm_power")
-KEYS: Mapping[str, tuple[str, ...]] = {
-    "drop_images": ("share", "duration"),
-    "dead_camera": ("duration",),
-    "can_errors": ("share", "duration"),
-    "bus_off": ("duration",),
-    "drive_fault": ("joint",),
-    "slow_arm": ("factor",),
-    "arm_power": ("duration",),
-    "clear": (),
-}
-
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One fault: from `start` to `end` (s on the laboratory's clock); `value` is its share, factor or joint (1 to 6)."""
+    """One fault: from `start` to `end` (s on the laboratory's clock); `value` is its share, factor or joint (from 1)."""
 
     kind: str
     start: float
     end: float
     value: float
+    lasts: bool = True
+    """Whether it goes on until its end, or happens once."""
+
+
+@dataclass(frozen=True, slots=True)
+class FaultKinds:
+    """The faults of one laboratory: which keys each takes, and how many drives there are."""
+
+    keys: Mapping[str, tuple[str, ...]]
+    drives: int
+
+    def read(self, now: float, kind: str, arguments: Mapping[str, Any]) -> Fault:
+        """A fault as a caller asks for it. Raises ValueError that says what is wrong and what fits."""
+        if kind not in self.keys:
+            raise ValueError(f"no fault is called {kind!r}; there are {', '.join(self.keys)}")
+        keys = self.keys[kind]
+        unknown = sorted(set(arguments) - {*keys, "after"})
+        if unknown:
+            raise ValueError(f"{kind} takes no {unknown[0]!r}, but {', '.join((*keys, 'after'))}")
+        after = _number(arguments, "after", 0.0, 0.0, math.inf)
+        duration = _number(arguments, "duration", math.inf, 0.0, math.inf)
+        value = 1.0
+        if "share" in keys:
+            value = _number(arguments, "share", 1.0, 0.0, 1.0)
+        elif "factor" in keys:
+            value = _number(arguments, "factor", None, 0.05, 1.0)
+        elif "joint" in keys:
+            value = _number(arguments, "joint", None, 1.0, float(self.drives))
+            if value != int(value):
+                raise ValueError(f"joint is {value!r}: give a whole number from 1 to {self.drives}")
+        return Fault(kind, now + after, now + after + duration, value, "duration" in keys)
+
+
+ARM_FAULTS: Final = FaultKinds(
+    keys={
+        "drop_images": ("share", "duration"),
+        "dead_camera": ("duration",),
+        "can_errors": ("share", "duration"),
+        "bus_off": ("duration",),
+        "drive_fault": ("joint",),
+        "slow_arm": ("factor",),
+        "arm_power": ("duration",),
+        "clear": (),
+    },
+    drives=6,
+)
 
 
 def read_fault(now: float, kind: str, arguments: Mapping[str, Any]) -> Fault:
-    """A fault as a caller asks for it. Raises ValueError that says what is wrong and what fits."""
-    if kind not in KEYS:
-        raise ValueError(f"no fault is called {kind!r}; there are {', '.join(KEYS)}")
-    unknown = sorted(set(arguments) - {*KEYS[kind], "after"})
-    if unknown:
-        raise ValueError(f"{kind} takes no {unknown[0]!r}, but {', '.join((*KEYS[kind], 'after'))}")
-    after = _number(arguments, "after", 0.0, 0.0, math.inf)
-    duration = _number(arguments, "duration", math.inf, 0.0, math.inf)
-    value = 1.0
-    if "share" in KEYS[kind]:
-        value = _number(arguments, "share", 1.0, 0.0, 1.0)
-    elif kind == "slow_arm":
-        value = _number(arguments, "factor", None, 0.05, 1.0)
-    elif kind == "drive_fault":
-        value = _number(arguments, "joint", None, 1.0, 6.0)
-        if value != int(value):
-            raise ValueError(f"joint is {value!r}: give a whole number from 1 to 6")
-    return Fault(kind, now + after, now + after + duration, value)
+    """A fault of the catching cell's as a caller asks for it. Raises ValueError that says what is wrong and what fits."""
+    return ARM_FAULTS.read(now, kind, arguments)
 
 
 def _number(arguments: Mapping[str, Any], key: str, default: float | None, low: float, high: float) -> float:
@@ -98,7 +116,7 @@ class FaultPlan:
         for fault in begun:
             if fault.kind == "clear":
                 self._lasting.clear()
-            elif fault.kind in LASTING:
+            elif fault.lasts:
                 self._lasting.append(fault)
         if self._lasting:
             self._lasting = [f for f in self._lasting if f.end > now]

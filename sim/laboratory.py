@@ -11,31 +11,28 @@ from typing import Any
 
 import numpy as np
 
-from services.comm.callee import Callee, Offer
 from services.comm.canbus import Frame
-from services.comm.channels import can_body, image_body, read_can, read_images_wanted
 from services.comm.directory import Directory
-from services.comm.messages import Call, Executed, Outcome
-from services.comm.party import TICK, Envelope
+from services.comm.party import TICK
 from sim.camera import Picture, PinholeCamera
 from sim.drives import DriveBus
-from sim.exposures import Exposures, camera_of
+from sim.exposures import camera_of
 from sim.faults import Fault, FaultPlan, read_fault
+from sim.laboratory_party import FAULT, SCORE, LaboratoryParty, whole_number
 from sim.oracle import Oracle
 from sim.puma import ArmPlant
 from sim.puma_model import Frame3
 from sim.referee import Referee
 from sim.site import CupMount, Site, site_of
 from sim.thrower import Thrower
-from sim.truth import LaboratoryError, Truth
+from sim.truth import Truth
 from sim.world import World
 
-PREPARE, SCORE, FAULT = SERVICES = ("laboratory_prepare", "laboratory_score", "laboratory_fault")
 _NOISE, _FAULTS = 0x6361, 0x6661
 """Keep the draws of camera noise and of faults apart from other draws of the same seed."""
 
 
-class Laboratory:
+class Laboratory(LaboratoryParty):
     """The party of the simulated node `name`. `where` gives the party of an endpoint (`Directory.party`)."""
 
     def __init__(
@@ -51,13 +48,8 @@ class Laboratory:
         directory: str = "",
     ) -> None:
         """Raises LaboratoryError for a regime that means nothing. `boot`, `directory`: as in services.comm.callee."""
-        self.name = name
+        super().__init__(name, where, boot, directory)
         self._site = site
-        self._where = where
-        self.now = 0.0
-        """How far the world has gone (s)."""
-        offers = {service: Offer(inline=lambda _, call: self.answer(call)) for service in SERVICES}
-        self.callee = Callee(name, boot, offers, directory=directory)
         truth = site.truth(regime)
         self._mount = CupMount(site.arm, truth)
         cup = site.cell["cup"]
@@ -65,10 +57,6 @@ class Laboratory:
         self.plant = ArmPlant(site.arm, site.cell["ball"]["gravity"], site.arm.poses["home"].tolist(), load=load)
         self._home: list[float] = site.arm.poses["home"].tolist()
         self.bus = DriveBus(self.plant, site.drives)
-        self.exposures = Exposures()
-        self._camera_at: dict[str, str] = {}
-        self._bus_ports: list[str] = []
-        self._out: list[Envelope] = []
         self._world: World | None = None
         self._prepare(self.now, seed, truth, throws)
 
@@ -88,35 +76,7 @@ class Laboratory:
         self._moves = -1
         self._cup = self._cup_now()
 
-    # The party
-
-    def receive(self, now: float, envelope: Envelope) -> None:
-        """Frames, wishes for images, and calls."""
-        if envelope.channel == "can":
-            self.receive_frames(now, envelope.source, read_can(envelope.body))
-        elif envelope.channel == "control":
-            wanted = read_images_wanted(envelope.body)
-            if wanted is not None:
-                self._camera_at = {envelope.source: self._where(envelope.source)}
-                self.exposures.want(now, wanted.rate, wanted.generation)
-        elif envelope.channel == "call":
-            self.callee.receive(now, self._where(envelope.source), envelope.body)
-
-    def advance(self, now: float) -> None:
-        """One tick, then what leaves."""
-        self.tick(now)
-        self._send_frames()
-        self._send_images(now)
-        self.callee.advance(now)
-        for peer, message in self.callee.messages():
-            self._out.append(Envelope(peer, self.name, peer, "call", message))
-
-    def drain(self) -> Sequence[Envelope]:
-        """What was sent since the last call, in order."""
-        out, self._out = self._out, []
-        return out
-
-    # What lock step and real time share
+    # The world, as lock step and real time drive it
 
     def tick(self, now: float) -> None:
         """Exposure of the world as it is at `now`, then on to `now` + TICK."""
@@ -128,10 +88,8 @@ class Laboratory:
 
     # Bus
 
-    def receive_frames(self, now: float, port: str, frames: Sequence[Frame]) -> None:
-        """Frames of the endpoint `port`, which from now on gets the bus's."""
-        if port not in self._bus_ports:
-            self._bus_ports.append(port)
+    def take_on_bus(self, now: float, frames: Sequence[Frame]) -> None:
+        """Frames of the master's."""
         receive = self.bus.receive
         for frame in self._faults.passed(frames):
             receive(now, frame)
@@ -139,14 +97,6 @@ class Laboratory:
     def take_frames(self) -> Sequence[Frame]:
         """Frames of drives and inputs since the last call."""
         return self._faults.passed(self.bus.drain())
-
-    def _send_frames(self) -> None:
-        if not self._bus_ports:
-            return
-        frames = self.take_frames()
-        if frames:
-            for port in self._bus_ports:
-                self._out.append(Envelope(self._where(port), self.name, port, "can", can_body(frames)))
 
     # Camera
 
@@ -156,8 +106,9 @@ class Laboratory:
         ready = now + self.truth.settings["camera"]["readout"] + self.truth.image_latency
         self.exposures.put(now, ready, self._picture(now))
 
-    def draw_scene(self, regime: str) -> None:
-        """Draw the still scene of a regime's camera ahead of its first image. Raises LaboratoryError."""
+    def make_ready(self, arguments: Mapping[str, Any]) -> None:
+        """Draw the still scene of a regime's camera ahead of its first image, which takes seconds. Raises LaboratoryError."""
+        regime = str(arguments.get("regime", "A"))
         camera_of(self._site.cell, self._site.truth(regime), self._noise).warm_up()
 
     def camera(self) -> PinholeCamera:
@@ -177,14 +128,6 @@ class Laboratory:
             pose,
             self.truth.light(now),
         )
-
-    def _send_images(self, now: float) -> None:
-        """An image arrives a tick after it is sent: it is sent a tick early, with the age that it has on arrival."""
-        arrival = now + TICK
-        for image in self.exposures.take(arrival):
-            body = image_body(image.pixels, arrival - image.time, image.sequence, image.generation)
-            for device, party in self._camera_at.items():
-                self._out.append(Envelope(party, self.name, device, "image", body))
 
     # World
 
@@ -254,14 +197,6 @@ class Laboratory:
         elif fault.kind == "slow_arm":
             self.bus.slow_down(fault.value)
 
-    def answer(self, call: Call) -> Outcome:
-        """Answer a call of one of `SERVICES`."""
-        try:
-            values = self.serve(call.service, call.arguments)
-        except (LaboratoryError, ValueError) as fault:
-            return Outcome(call.id, "error", {}, "bad_arguments", str(fault), Executed.NO)
-        return Outcome(call.id, "success", values)
-
     def serve(self, service: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Answer one of `SERVICES`. Raises ValueError (LaboratoryError among them) for arguments that cannot be.
 
@@ -275,12 +210,8 @@ class Laboratory:
             rest = {key: value for key, value in arguments.items() if key != "kind"}
             self._faults.add(read_fault(self.now, str(arguments.get("kind", "")), rest))
             return {}
-        seed, regime, throws = arguments.get("seed", 0), arguments.get("regime", "A"), arguments.get("throws")
-        if type(seed) is not int or seed < 0:
-            raise ValueError(f"seed is {seed!r}: give a whole number, 0 or more")
-        if throws is not None and (type(throws) is not int or throws < 0):
-            raise ValueError(f"throws is {throws!r}: give a whole number, 0 or more, or leave it out")
-        self._prepare(self.now, seed, self._site.truth(str(regime)), throws)
+        seed, throws = whole_number(arguments, "seed", 0) or 0, whole_number(arguments, "throws", None)
+        self._prepare(self.now, seed, self._site.truth(str(arguments.get("regime", "A"))), throws)
         return {}
 
     def close(self) -> None:

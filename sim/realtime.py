@@ -28,12 +28,11 @@ from services.comm.callee import Callee, Offer, Order, StartRun
 from services.comm.camera import ImageServer
 from services.comm.can_hub import Hub
 from services.comm.credentials import credentials
-from services.comm.directory import Directory
+from services.comm.directory import Directory, resolve
 from services.comm.messages import Call, Outcome
 from services.comm.party import TICK
 from services.comm.server import Server
-from sim.laboratory import PREPARE, SERVICES, Laboratory
-from sim.site import site_of
+from sim.laboratory_party import LaboratoryParty
 from sim.truth import LaboratoryError
 
 SLIP: Final = 0.1
@@ -47,8 +46,8 @@ PRIORITY = 5
 class Pacemaker:
     """Moves a laboratory along with the clock and carries frames and images. `run` until `stop`, in a thread of its own."""
 
-    def __init__(self, laboratory: Laboratory, hub: Hub | None, images: ImageServer | None) -> None:
-        """`hub`: the arm's bus, `images`: the camera's end of the wire; None where the cell has none."""
+    def __init__(self, laboratory: LaboratoryParty, hub: Hub | None, images: ImageServer | None) -> None:
+        """`hub`: the bus, `images`: the camera's end of the wire; None where the cell has none."""
         self.lock = threading.Lock()
         self.slipped = 0.0
         """s by which the world has fallen behind the clock for good."""
@@ -137,15 +136,19 @@ class LaboratoryShell:
     """A running laboratory of one simulated node of services.toml. Between `start` and `close` it serves."""
 
     def __init__(self, directory: Directory, name: str) -> None:
-        """Raises LaboratoryError, ValueError for an address that cannot be, OSError for one that is taken."""
+        """Raises LaboratoryError, ImportError for a `sim` that is not there, ValueError for an address that cannot be, OSError
+        for one that is taken."""
         self._directory = directory
         self._name = name
-        self.laboratory = Laboratory(name, site_of(directory), directory.party)
+        self.laboratory = _made(directory, name)
         channel, address = bus_channel(directory), camera_address(directory)
         self._hub = Hub(channel) if channel else None
         self._images = ImageServer(*address) if address else None
         self.pacemaker = Pacemaker(self.laboratory, self._hub, self._images)
-        offers = {service: Offer(inline=None if service == PREPARE else self._answer) for service in SERVICES}
+        offers = {
+            service: Offer(inline=None if service == self.laboratory.between_ticks else self._answer)
+            for service in self.laboratory.services
+        }
         callee = Callee(name, secrets.token_hex(8), offers, directory=directory.hash)
         proves = credentials(directory, name)
         self.server = Server(callee, on_orders=self._obey, key=proves.key, tls=proves.server())
@@ -157,9 +160,9 @@ class LaboratoryShell:
         self._fault: BaseException | None = None
 
     async def start(self) -> None:
-        """Draw the still scene, start the world's clock, then listen. Raises OSError, KeyNeededError."""
+        """Make all ready that takes long, start the world's clock, then listen. Raises OSError, KeyNeededError."""
         if self._images is not None:
-            self.laboratory.draw_scene("A")
+            self.laboratory.make_ready({})
         gc.collect()
         gc.freeze()  # what is here stays: the collector need not look at it in mid-tick
         self._loop = asyncio.get_running_loop()
@@ -205,14 +208,26 @@ class LaboratoryShell:
                 task.add_done_callback(self._preparing.discard)
 
     async def _prepare(self, call: Call) -> None:
-        """A regime in which the camera hangs elsewhere needs seconds to draw its still scene: not in the loop, not in a tick."""
-        with contextlib.suppress(LaboratoryError):  # the answer says what is wrong with the regime
-            await asyncio.to_thread(self.laboratory.draw_scene, str(call.arguments.get("regime", "A")))
+        """What takes long comes first (a camera that hangs elsewhere needs seconds to draw its still scene): not in the loop,
+        not in a tick."""
+        with contextlib.suppress(ValueError):  # the answer says what is wrong with the arguments
+            await asyncio.to_thread(self.laboratory.make_ready, call.arguments)
         outcome = await asyncio.wrap_future(self.pacemaker.submit(lambda: self.laboratory.answer(call)))
         self.server.callee.finish(
             self.server.now(), call.id, outcome.status, outcome.values, outcome.cause, outcome.text, outcome.executed
         )
         self.server.flush()
+
+
+def _made(directory: Directory, name: str) -> LaboratoryParty:
+    """The laboratory that the node's `sim` makes. Raises LaboratoryError for one that is no `LaboratoryParty`."""
+    made = resolve(directory.nodes[name].sim)(directory, name)
+    if not isinstance(made, LaboratoryParty):
+        raise LaboratoryError(
+            f"{directory.source}: [nodes.{name}] sim makes a {type(made).__name__}; in real time it must be a "
+            "sim.laboratory_party.LaboratoryParty"
+        )
+    return made
 
 
 def bus_channel(directory: Directory) -> str:

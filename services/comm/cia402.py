@@ -43,7 +43,7 @@ class State(Enum):
 
 
 class StatusBit(IntEnum):
-    """Statusword bits outside the state pattern; 12 and 13 as in cyclic synchronous position mode."""
+    """Statusword bits outside the state pattern; 12 and 13 as in cyclic synchronous position mode, 12 also as in velocity mode."""
 
     VOLTAGE_ENABLED = 1 << 4
     WARNING = 1 << 7
@@ -74,9 +74,15 @@ class Mode(IntEnum):
 
     NONE = 0
     CYCLIC_SYNCHRONOUS_POSITION = 8
+    CYCLIC_SYNCHRONOUS_VELOCITY = 9
+
+    @property
+    def bit(self) -> int:
+        """Its bit in object 6502h, supported drive modes (modes 1 and up)."""
+        return 1 << (self.value - 1)
 
 
-SUPPORTED_MODES: Final = 1 << (Mode.CYCLIC_SYNCHRONOUS_POSITION - 1)
+SUPPORTED_MODES: Final = Mode.CYCLIC_SYNCHRONOUS_POSITION.bit
 """Object 6502h of a drive that knows cyclic synchronous position alone."""
 
 DEVICE_TYPE: Final = 0x0002_0192
@@ -141,12 +147,14 @@ class Object(IntEnum):
     FOLLOWING_ERROR_TIMEOUT = 0x6066
     VELOCITY = 0x606C
     TORQUE = 0x6077
+    DC_LINK_VOLTAGE = 0x6079
     TARGET_POSITION = 0x607A
     SOFTWARE_LIMITS = 0x607D
     MAX_SPEED = 0x607F
     QUICK_STOP_DECELERATION = 0x6085
     INTERPOLATION_PERIOD = 0x60C2
     FOLLOWING_ERROR = 0x60F4
+    TARGET_VELOCITY = 0x60FF
     SUPPORTED_MODES = 0x6502
 
 
@@ -154,14 +162,20 @@ RECEIVED: Final = (
     Mapped(Object.CONTROLWORD, 0, Type.UNSIGNED16),
     Mapped(Object.TARGET_POSITION, 0, Type.INTEGER32),
 )
-"""Objects of the RPDO that the master sends each drive in each cycle."""
+"""Objects of the RPDO that the master sends each drive in each cycle, in cyclic synchronous position mode."""
+
+VELOCITY_RECEIVED: Final = (
+    Mapped(Object.CONTROLWORD, 0, Type.UNSIGNED16),
+    Mapped(Object.TARGET_VELOCITY, 0, Type.INTEGER32),
+)
+"""The same in cyclic synchronous velocity mode."""
 
 SENT: Final = (
     Mapped(Object.STATUSWORD, 0, Type.UNSIGNED16),
     Mapped(Object.POSITION, 0, Type.INTEGER32),
     Mapped(Object.TORQUE, 0, Type.INTEGER16),
 )
-"""Objects of the TPDO that each drive sends on SYNC."""
+"""Objects of the TPDO that each drive sends on SYNC, in either mode."""
 
 
 def _state(statusword: int) -> State | None:

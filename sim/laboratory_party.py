@@ -1,0 +1,138 @@
+"""What every simulated laboratory has in common: a party with a bus, a camera and services, that lock step and real time drive.
+
+A subclass is a world: it moves on by `tick`, takes and gives frames, exposes images, answers its services. Nothing here knows
+wall-clock time.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar
+
+from services.comm.callee import Callee, Offer
+from services.comm.canbus import Frame
+from services.comm.channels import can_body, image_body, read_can, read_images_wanted
+from services.comm.messages import Call, Executed, Outcome
+from services.comm.party import TICK, Envelope
+from sim.exposures import Exposures
+
+PREPARE, SCORE, FAULT = SERVICES = ("laboratory_prepare", "laboratory_score", "laboratory_fault")
+
+
+class LaboratoryParty(ABC):
+    """The party of a simulated node. `where` gives the party of an endpoint (`Directory.party`)."""
+
+    services: ClassVar[Sequence[str]] = SERVICES
+    """What it answers."""
+    between_ticks: ClassVar[str] = PREPARE
+    """The service that may take longer than a tick: in real time the world waits for it, not the callers."""
+
+    def __init__(self, name: str, where: Callable[[str], str], boot: str, directory: str) -> None:
+        """`boot`, `directory`: as in services.comm.callee."""
+        self.name = name
+        self.now = 0.0
+        """How far the world has gone (s)."""
+        offers = {service: Offer(inline=lambda _, call: self.answer(call)) for service in self.services}
+        self.callee = Callee(name, boot, offers, directory=directory)
+        self.exposures = Exposures()
+        self._where = where
+        self._camera_at: dict[str, str] = {}
+        self._bus_ports: list[str] = []
+        self._out: list[Envelope] = []
+
+    # What a world adds
+
+    @abstractmethod
+    def tick(self, now: float) -> None:
+        """Exposure of the world as it is at `now`, then on to `now` + TICK."""
+
+    @abstractmethod
+    def take_on_bus(self, now: float, frames: Sequence[Frame]) -> None:
+        """Frames of the master's."""
+
+    @abstractmethod
+    def take_frames(self) -> Sequence[Frame]:
+        """Frames of the simulated devices since the last call."""
+
+    @abstractmethod
+    def serve(self, service: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Answer one of `services`. Raises ValueError for arguments that cannot be."""
+
+    @abstractmethod
+    def make_ready(self, arguments: Mapping[str, Any]) -> None:
+        """Do beforehand, in any thread, what a preparation with these arguments would take long for. Raises ValueError."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let go what the world holds."""
+
+    # The party
+
+    def receive(self, now: float, envelope: Envelope) -> None:
+        """Frames, wishes for images, and calls."""
+        if envelope.channel == "can":
+            self.receive_frames(now, envelope.source, read_can(envelope.body))
+        elif envelope.channel == "control":
+            wanted = read_images_wanted(envelope.body)
+            if wanted is not None:
+                self._camera_at = {envelope.source: self._where(envelope.source)}
+                self.exposures.want(now, wanted.rate, wanted.generation)
+        elif envelope.channel == "call":
+            self.callee.receive(now, self._where(envelope.source), envelope.body)
+
+    def advance(self, now: float) -> None:
+        """One tick, then what leaves."""
+        self.tick(now)
+        self._send_frames()
+        self._send_images(now)
+        self.callee.advance(now)
+        for peer, message in self.callee.messages():
+            self._out.append(Envelope(peer, self.name, peer, "call", message))
+
+    def drain(self) -> Sequence[Envelope]:
+        """What was sent since the last call, in order."""
+        out, self._out = self._out, []
+        return out
+
+    def receive_frames(self, now: float, port: str, frames: Sequence[Frame]) -> None:
+        """Frames of the endpoint `port`, which from now on gets the bus's."""
+        if port not in self._bus_ports:
+            self._bus_ports.append(port)
+        self.take_on_bus(now, frames)
+
+    def answer(self, call: Call) -> Outcome:
+        """Answer a call of one of `services`."""
+        try:
+            values = self.serve(call.service, call.arguments)
+        except ValueError as fault:
+            return Outcome(call.id, "error", {}, "bad_arguments", str(fault), Executed.NO)
+        return Outcome(call.id, "success", values)
+
+    def _send_frames(self) -> None:
+        if not self._bus_ports:
+            return
+        frames = self.take_frames()
+        if frames:
+            for port in self._bus_ports:
+                self._out.append(Envelope(self._where(port), self.name, port, "can", can_body(frames)))
+
+    def _send_images(self, now: float) -> None:
+        """An image arrives a tick after it is sent: it is sent a tick early, with the age that it has on arrival."""
+        arrival = now + TICK
+        for image in self.exposures.take(arrival):
+            body = image_body(image.pixels, arrival - image.time, image.sequence, image.generation)
+            for device, party in self._camera_at.items():
+                self._out.append(Envelope(party, self.name, device, "image", body))
+
+
+def whole_number(arguments: Mapping[str, Any], key: str, default: int | None) -> int | None:
+    """A whole number, 0 or more, among the arguments of a call. Raises ValueError."""
+    value = arguments.get(key, default)
+    if value is None and default is None:
+        return None
+    if type(value) is not int or value < 0:
+        raise ValueError(
+            f"{key} is {value!r}: give a whole number, 0 or more" + (", or leave it out" if default is None else "")
+        )
+    return value
