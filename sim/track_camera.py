@@ -60,7 +60,7 @@ class Mount:
         return np.asarray(self.focal * seen[..., :2] / seen[..., 2:] + self.principal)
 
     def to_floor(self) -> Array:
-        """(3, 3) homography from pixels (u, v, 1) to the body frame's floor. Raises ValueError if a pixel looks over the horizon."""
+        """(3, 3) homography from pixels (u, v, 1) to the body frame's floor. Raises ValueError for a pixel above the horizon."""
         u0, v0 = self.principal
         rays = self.rotation.T @ np.array(
             [[1.0, 0.0, -u0], [0.0, 1.0, -v0], [0.0, 0.0, self.focal]]
@@ -87,7 +87,8 @@ class FloorCamera:
     def __init__(
         self, mount: Mount, exposure: float, greys: tuple[float, float], noise: float, vignetting: float
     ) -> None:
-        """`exposure` in s, `greys` of black and white paint, `noise` in grey levels (sigma), `vignetting`: light lost in the corners."""
+        """`exposure` in s; `greys` of black and white paint; `noise` in grey levels (sigma); `vignetting`: share of the light
+        that the corners lose."""
         self.mount = mount
         self.exposure = exposure
         self._to_floor = mount.to_floor()
