@@ -16,12 +16,12 @@ for another boot), forgotten (its result was kept no longer).
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Final
 
 from services.comm.events import EventBoard
+from services.comm.going import DEADLINE, NEVER, GoingRuns, Run
 from services.comm.messages import (
     Accept,
     Answer,
@@ -52,20 +52,7 @@ from services.comm.wire import NEWEST_VERSION, negotiate
 __all__ = ["Callee", "CancelRun", "Commanded", "Inline", "Keeping", "Offer", "Order", "StartRun"]
 
 ERROR: Final = "error"
-_NEVER: Final = float("inf")
-
-
-@dataclass(slots=True)
-class _Run:
-    """A run that goes on. `stopping` once it was ordered to stop, `reason` then says why."""
-
-    call: Call
-    peer: str
-    began: float
-    device: str
-    orphan_time: float | None
-    stopping: bool = False
-    reason: str = ""
+HOLD, RELEASE, HELD = "hold", "release", "held"
 
 
 class Callee:
@@ -90,14 +77,14 @@ class Callee:
         self.offers: Mapping[str, Offer] = dict(offers)
         self.directory = directory
         self.events = EventBoard()
-        self.soonest = _NEVER
+        self.soonest = NEVER
         """Never later than `due` (s): a shell whose timer is set for no later time need not ask for that."""
         self._keeping = keeping or Keeping()
         self._peers = Peers(name, directory, any_directory, self._keeping.lease)
-        self._running: dict[str, _Run] = {}
+        self._running = GoingRuns()
         self._results = ResultStore(self._keeping, self.events.forget_run)
-        self._commands: dict[str, str] = {}
-        self._timers: list[tuple[float, str, str]] = []
+        self._commands: dict[str, tuple[str, str]] = {}
+        """Peer and verb of each command that waits for its answer."""
         self._orders: list[Order] = []
         self._messages: list[tuple[str, Message]] = []
         self._takers: Mapping[type, Callable[[float, str, Any], None]] = {
@@ -133,7 +120,8 @@ class Callee:
         self.events.peer_down(peer, leaves)
         for id_, run in self._running.items():
             if run.peer == peer and run.orphan_time is not None:
-                self._set_timer(now + run.orphan_time, "orphan", id_)
+                self._running.watch_orphan(id_, now + run.orphan_time)
+                self.soonest = min(self.soonest, now + run.orphan_time)
 
     # What callers say.
 
@@ -222,10 +210,11 @@ class Callee:
             return Outcome(call.id, ERROR, {}, "crashed", text, Executed.UNKNOWN)
 
     def _start(self, now: float, peer: str, call: Call, offer: Offer) -> None:
-        self._running[call.id] = _Run(call, peer, now, offer.device, offer.orphan_time)
+        self._running[call.id] = Run(call, peer, now, offer.device, offer.orphan_time)
         deadline = call.deadline if call.deadline is not None else offer.deadline
         if deadline is not None:
-            self._set_timer(now + deadline, "deadline", call.id)
+            self._running.limit(call.id, now + deadline)
+            self.soonest = min(self.soonest, now + deadline)
         self._messages.append((peer, Accept(call.id)))
         self._orders.append(StartRun(call, peer))
 
@@ -254,7 +243,10 @@ class Callee:
         self.events.acknowledge(peer, ack.source, ack.number)
 
     def _take_command(self, now: float, peer: str, command: Command) -> None:
-        self._commands[command.id] = peer
+        self._commands[command.id] = peer, command.verb
+        if command.verb == RELEASE:
+            self._running.release_all(now, [command.target] if command.target else None)
+            self.soonest = min(self.soonest, self._running.due())
         self._orders.append(Commanded(command, peer))
 
     # What the node reports.
@@ -324,10 +316,15 @@ class Callee:
         return event
 
     def answer(self, now: float, id: str, ok: bool, data: Mapping[str, Any] | None = None) -> None:  # noqa: A002
-        """Answer a command."""
-        peer = self._commands.pop(id, None)
-        if peer is None:
+        """Answer a command. Of a `hold`, `answers` in the data say by device (runs without one: this node's name) what became
+        of it: the deadlines of runs that are held stand still until a `release`. Raises ValueError if nobody waits for it.
+        """
+        peer, verb = self._commands.pop(id, ("", ""))
+        if not peer:
             raise ValueError(f"command {id}: nobody waits for its answer")
+        if verb == HOLD and data is not None:
+            answers = data.get("answers", {})
+            self._running.hold_all(now, ["" if d == self.name else d for d, said in answers.items() if said == HELD])
         self._send(peer, Answer(id, ok, plain(data or {}, "data")))
 
     # What the node takes out.
@@ -350,30 +347,22 @@ class Callee:
 
     def advance(self, now: float) -> None:
         """Stop what is over its deadline or an orphan for too long; forget what was kept long enough."""
-        while self._timers and self._timers[0][0] <= now:
-            due, kind, id_ = heapq.heappop(self._timers)
-            run = self._running.get(id_)
-            if run is not None and (kind == "deadline" or self._is_orphan(run, due)):
+        for due, kind, id_, run in self._running.over(now):
+            if kind == DEADLINE or self._is_orphan(run, due):
                 self._stop(id_, run, kind, kind)
         self._results.advance(now)
 
-    def _is_orphan(self, run: _Run, now: float) -> bool:
+    def _is_orphan(self, run: Run, now: float) -> bool:
         return run.orphan_time is not None and self._peers.is_away(now, run.peer, run.orphan_time)
 
     def due(self) -> float | None:
         """When `advance` has something to do next (s), None if never."""
-        while self._timers and self._timers[0][2] not in self._running:
-            heapq.heappop(self._timers)
-        soonest = self._timers[0][0] if self._timers else _NEVER
+        soonest = self._running.due()
         results = self._results.due()
         self.soonest = soonest if results is None else min(soonest, results)
-        return self.soonest if self.soonest < _NEVER else None
+        return self.soonest if self.soonest < NEVER else None
 
-    def _set_timer(self, due: float, kind: str, id_: str) -> None:
-        heapq.heappush(self._timers, (due, kind, id_))
-        self.soonest = min(self.soonest, due)
-
-    def _stop(self, id_: str, run: _Run, reason: str, cause: str) -> None:
+    def _stop(self, id_: str, run: Run, reason: str, cause: str) -> None:
         if not run.stopping:
             run.stopping, run.reason = True, cause
             self._orders.append(CancelRun(id_, reason))

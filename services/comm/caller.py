@@ -32,19 +32,8 @@ from services.comm.plain import plain
 from services.comm.settled import Settled
 from services.comm.under_way import NEVER, Patience, Pending, UnderWay
 
-__all__ = [
-    "Accepted",
-    "Answered",
-    "Caller",
-    "Ended",
-    "EventArrived",
-    "Late",
-    "Notice",
-    "Patience",
-    "PeerBack",
-    "PeerLost",
-    "Progress",
-]
+__all__ = ["Accepted", "Answered", "Caller", "Ended", "EventArrived", "Late", "Notice", "Patience", "PeerBack"]
+__all__ += ["PeerLost", "Progress"]
 
 ERROR: Final = "error"
 
@@ -83,8 +72,8 @@ class Caller:
             m.Answer: self._take_answer,
             m.Welcome: self.link_up,
             m.Refuse: self.link_refused,
-            m.Bye: self._take_bye,
-            m.Ping: self._take_ping,
+            m.Bye: lambda now, bye: self.link_down(now, bye.text or "it left"),
+            m.Ping: lambda now, ping: self._messages.append(m.Pong(ping.number)),
         }
 
     def open(self, now: float) -> None:
@@ -130,8 +119,10 @@ class Caller:
         elif self._held_until is None or now >= self._held_until:
             self._end(id, "unreachable", f"{self.peer} is not there", pending.if_unsent)
 
-    def cancel(self, now: float, id: str, reason: str = "") -> None:  # noqa: A002
-        """Ask for a call's run to be stopped; it still ends with one `Ended`. An id that is not under way is left alone."""
+    def cancel(self, now: float, id: str, reason: str = "", within: float | None = None) -> None:  # noqa: A002
+        """Ask for a call's run to be stopped; it still ends with one `Ended`, `no_answer` if the peer does not say so
+        `within` seconds (None: `Patience.stop`). An id that is not under way is left alone.
+        """
         pending = self._pending.get(id)
         if pending is None or pending.cancel is not None:
             return
@@ -139,9 +130,19 @@ class Caller:
             self._end(id, "cancelled", reason, m.Executed.NO)
             return
         pending.cancel = reason
-        self._watch(pending, now + self._patience.stop)
+        self._pending.release(now, id)
+        self._watch(pending, now + (self._patience.stop if within is None else within))
         if self.up:
             self._messages.append(m.Cancel(id, reason))
+
+    def hold(self, now: float, id: str) -> None:  # noqa: A002
+        """The peer holds this call's run: it is not waited for until `release`."""
+        self._pending.hold(now, id)
+
+    def release(self, now: float, id: str) -> None:  # noqa: A002
+        """The run goes on."""
+        self._pending.release(now, id)
+        self.soonest = min(self.soonest, self._pending.due())
 
     def cancel_children(self, now: float, parent: str, reason: str = "") -> None:
         """Cancel all calls made on behalf of this one."""
@@ -289,12 +290,6 @@ class Caller:
     def _take_answer(self, now: float, answer: m.Answer) -> None:
         if self._commands.pop(answer.id, None) is not None:
             self._notices.append(Answered(answer))
-
-    def _take_bye(self, now: float, bye: m.Bye) -> None:
-        self.link_down(now, bye.text or "it left")
-
-    def _take_ping(self, now: float, ping: m.Ping) -> None:
-        self._messages.append(m.Pong(ping.number))
 
     def advance(self, now: float) -> None:
         """End what has waited too long."""

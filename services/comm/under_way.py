@@ -44,6 +44,8 @@ class Pending:
     cancel: str | None = None
     accept_due: float = NEVER
     result_due: float = NEVER
+    held: float | None = None
+    """Since when an operator holds its run."""
 
     @property
     def if_unsent(self) -> Executed:
@@ -70,6 +72,22 @@ class UnderWay(dict[str, Pending]):
             pending.result_due = due
             heapq.heappush(self._results, (due, pending.call.id))
 
+    def hold(self, now: float, id_: str) -> None:
+        """The wait for this call's RESULT stands still."""
+        pending = self.get(id_)
+        if pending is not None and pending.held is None:
+            pending.held = now
+
+    def release(self, now: float, id_: str) -> None:
+        """The wait goes on, later by the pause."""
+        pending = self.get(id_)
+        if pending is None or pending.held is None:
+            return
+        pause, pending.held = now - pending.held, None
+        if pending.result_due < NEVER:
+            pending.result_due += pause
+            heapq.heappush(self._results, (pending.result_due, id_))
+
     def not_accepted(self, now: float) -> Iterator[str]:
         """Ids that have waited too long for ACCEPT."""
         while self._accepts and self._accepts[0][0] <= now:
@@ -81,8 +99,9 @@ class UnderWay(dict[str, Pending]):
     def not_answered(self, now: float) -> Iterator[str]:
         """Ids that have waited too long for RESULT."""
         while self._results and self._results[0][0] <= now:
-            _, id_ = heapq.heappop(self._results)
-            if id_ in self:
+            due, id_ = heapq.heappop(self._results)
+            pending = self.get(id_)
+            if pending is not None and pending.held is None and due >= pending.result_due:
                 yield id_
 
     def due(self) -> float:

@@ -333,3 +333,45 @@ def test_callers_that_came_and_went_do_not_fill_the_memory() -> None:
         callee.link_down(0.0, name)
     assert len(callee._peers._peers) <= 257
     assert callee.events.raise_event(m.Event("tick", "timer", 0), False, "")[1] == []
+
+
+@pytest.mark.parametrize("target", ["arm", ""])
+def test_the_deadline_of_a_held_run_stands_still(target: str) -> None:
+    """An operator's pause of 4 s moves a deadline of 2 s to 6 s."""
+    callee = _callee(COORD)
+    callee.receive(0.0, "coord", m.Call("1", "move", {}, 2.0, 3))
+    callee.receive(0.5, "coord", m.Command("h", "hold", target))
+    callee.answer(1.0, "h", True, {"answers": {"arm": "held"}})
+    callee.orders()
+    callee.advance(4.9)
+    callee.receive(5.0, "coord", m.Command("r", "release", target))
+    assert [type(order) for order in callee.orders()] == [Commanded]
+    assert callee.due() == 6.0
+    callee.advance(5.99)
+    assert callee.orders() == []
+    callee.advance(6.0)
+    assert callee.orders() == [CancelRun("1", "deadline")]
+
+
+@pytest.mark.parametrize("answers", [{"arm": "cannot hold"}, {"camera": "held"}, {"motion": "held"}, {}])
+def test_the_deadline_of_a_run_that_goes_on_is_kept_during_a_pause(answers: dict[str, str]) -> None:
+    """A device that cannot hold, and a hold that another device answered."""
+    callee = _callee(COORD)
+    callee.receive(0.0, "coord", m.Call("1", "move", {}, 2.0, 3))
+    callee.receive(0.5, "coord", m.Command("h", "hold"))
+    callee.answer(1.0, "h", False, {"answers": answers})
+    callee.orders()
+    callee.advance(2.0)
+    assert callee.orders() == [CancelRun("1", "deadline")]
+
+
+def test_a_held_run_is_still_an_orphan_without_its_caller() -> None:
+    """A pause is no reason to go on without anybody."""
+    callee = _callee(COORD)
+    callee.receive(0.0, "coord", m.Call("1", "move", {}, 2.0, 3))
+    callee.receive(0.5, "coord", m.Command("h", "hold"))
+    callee.answer(1.0, "h", True, {"answers": {"arm": "held"}})
+    callee.orders()
+    callee.link_down(1.0, "coord")
+    callee.advance(2.0)
+    assert callee.orders() == [CancelRun("1", "orphan")]

@@ -195,6 +195,40 @@ def test_a_cancelled_call_that_never_ends_is_given_up() -> None:
     assert _ends(caller.notices()) == [("1", "no_answer", Executed.UNKNOWN)]
 
 
+def test_the_owner_says_how_long_stopping_may_take() -> None:
+    caller = _caller()
+    caller.call(0.0, m.Call("1", "move"))
+    caller.receive(0.1, m.Accept("1"))
+    caller.cancel(1.0, "1", "not wanted", within=0.5)
+    caller.notices()
+    caller.advance(1.4)
+    assert caller.notices() == []
+    caller.advance(1.5)
+    assert _ends(caller.notices()) == [("1", "no_answer", Executed.UNKNOWN)]
+
+
+@pytest.mark.parametrize("cancelled", [False, True])
+def test_a_held_run_is_not_waited_for_until_it_goes_on_or_is_cancelled(cancelled: bool) -> None:
+    """A deadline of 2 s and 5 s of patience, held from 1 s to 11 s: given up at 17 s; cancelled at 11 s: at 16 s."""
+    caller = _caller()
+    caller.call(0.0, CALL)
+    caller.receive(0.1, m.Accept("1"))
+    caller.hold(1.0, "1")
+    caller.hold(2.0, "1")
+    caller.advance(10.9)
+    caller.notices()
+    if cancelled:
+        caller.cancel(11.0, "1", "not wanted")
+    else:
+        caller.release(11.0, "1")
+    due = 16.0 if cancelled else 17.0
+    assert caller.soonest <= due
+    caller.advance(due - 0.1)
+    assert caller.notices() == []
+    caller.advance(due)
+    assert _ends(caller.notices()) == [("1", "no_answer", Executed.UNKNOWN)]
+
+
 def test_a_call_cancelled_before_it_leaves_ends_at_once() -> None:
     caller = _caller(up=False)
     caller.connecting(0.0)
