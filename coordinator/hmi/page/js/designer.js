@@ -24,7 +24,7 @@ export const snap = (value) => Math.round(value / GRID) * GRID;
 
 export class Designer {
   constructor(link, operator) {
-    Object.assign(this, { link, operator, offers: [], findings: [], text: "", tool: "select" });
+    Object.assign(this, { link, operator, offers: [], findings: [], text: "", tool: "select", documents: 0 });
     this.selection = { names: new Set(), arc: null };
     this.pointer = new Pointer(this);
     this.canvas = new Canvas("Drawing of the task", { keyed: true, down: (event) => this.pointer.down(event), chosen: (e, event) => this.pick(e.name, event), opened: (e) => this.opened(e), moved: () => this.canvas?.map.follow() });
@@ -79,8 +79,9 @@ export class Designer {
       this.everShown = true;
       const running = this.link.state.task?.name;
       const known = [...this.picker.options].map((o) => o.value).filter(Boolean);
-      if (known.length) await this.open(known.includes(running) ? running : known[0]);
-      else this.view.fit();
+      // who began something else while the list came in keeps that
+      if (known.length && !this.documents) await this.open(known.includes(running) ? running : known[0]);
+      else if (!this.documents) this.view.fit();
     }
     this.inspector.show(this.selection, true);
   }
@@ -92,9 +93,11 @@ export class Designer {
     this.picker.value = this.model.name;
   }
 
+  /** Open a task; of several documents asked for, the last one is shown whichever answer comes last. */
   async open(name) {
+    const asked = ++this.documents;
     const task = await openTask(name);
-    if (!task) return;
+    if (!task || asked !== this.documents) return;
     this.selection = { names: new Set(), arc: null };
     this.findings = task.findings;
     this.text = task.text;
@@ -114,6 +117,7 @@ export class Designer {
 
   async newTask() {
     if (this.model.dirty && !(await this.sure("Leave without saving?"))) return;
+    this.documents += 1;
     this.selection = { names: new Set(), arc: null };
     this.model.load({ name: "", revision: null, document: emptyDocument("new_task") });
     this.refreshTasks();
@@ -137,10 +141,12 @@ export class Designer {
     const name = this.model.name || (await askName("Save the task as", this.model.data.task?.name ?? "new_task"));
     if (!name) return false;
     if (!this.model.name && this.model.data.task?.name === "new_task") this.model.edit("name", (data) => (data.task.name = name));
+    const sent = { data: this.model.data, renames: this.model.renames };
+    const documents = this.documents;
     const saved = await saveTask(this.model, name);
-    if (!saved) return false;
+    if (!saved || documents !== this.documents) return false;
     if (saved.reload) this.model.load(saved);
-    else this.model.savedAs(saved);
+    else this.model.savedAs(saved, sent);
     this.findings = saved.findings;
     this.text = saved.text;
     await this.refreshTasks();
@@ -173,6 +179,7 @@ export class Designer {
     const form = file.name.endsWith(".toml") ? "toml" : "pnml";
     const made = await importNet(form, await file.text());
     if (!made) return;
+    this.documents += 1;
     this.model.load({ name: "", revision: null, document: made.document });
     await this.refreshTasks();
     this.view.fit();
@@ -218,8 +225,9 @@ export class Designer {
 
   async check() {
     const { model } = this;
-    const said = await checkDocument(model.name, model.data, model.renames);
-    if (!said || model !== this.model) return;
+    const checked = model.data;
+    const said = await checkDocument(model.name, checked, model.renames);
+    if (!said || checked !== this.model.data) return;
     this.findings = said.findings;
     this.text = said.text;
     this.paintFindings();

@@ -46,14 +46,13 @@ export class Model {
     this.changed("load");
   }
 
-  /** The server has what is drawn; undo goes on to work across a save. */
-  savedAs({ name, revision, document }) {
+  /** The server has what was `sent`; undo goes on to work across a save, and what was drawn meanwhile stays. */
+  savedAs({ name, revision, document }, sent) {
     this.name = name;
     this.base = revision;
     this.saved = JSON.stringify(document);
-    this.data = document;
-    this.renames = [];
-    for (const state of [...this.past, ...this.future]) state.renames = [];
+    if (this.data === sent.data) this.data = document;
+    for (const state of [this, ...this.past, ...this.future]) state.renames = state.renames.slice(sent.renames.length);
     this.changed("saved");
   }
 
