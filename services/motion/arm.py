@@ -18,20 +18,21 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from operator import sub
 from typing import Any, Final
 
 import numpy as np
 
 from services.device import Ports, Setpoint
+from services.motion.arm_settings import Settings, drive_settings, numbers
 from services.motion.barrier import Barrier
-from services.motion.drive_master import DriveMaster, DriveSettings, Phase
+from services.motion.drive_master import DriveMaster, Phase
 from services.motion.following import Follower
 from services.motion.interception import STRATEGIES, Interceptor, Strategy
 from services.motion.kinematics import Puma, branch_of
 from services.motion.limits import Guard
-from services.motion.model import JOINTS, ArmModel, Cell, nominal_arm, nominal_cell, read_arm, read_cell
+from services.motion.model import JOINTS
 from services.motion.steering import Steering
 
 PERIOD: Final = 0.004
@@ -52,40 +53,6 @@ BALL: Final = 0x01
 POWER: Final = 0x02
 
 
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """The driver's configuration in services.toml: stream of catch points and its period (s), speed (share of the joints'
-    greatest), whether to enable the drives at the start, and files instead of the package's own numbers."""
-
-    stream: str = "catch_point"
-    stream_period: float = 0.02
-    speed: float = 1.0
-    enable: bool = True
-    model: str = ""
-    cell: str = ""
-
-    @classmethod
-    def parse(cls, config: Mapping[str, Any]) -> Settings:
-        """From the device's table; keys that are not the arm's (node, driver, can, ...) are left alone. Raises ValueError."""
-        fields = {name: config[name] for name in cls.__slots__ if name in config}
-        for name, value in fields.items():
-            kind = type(getattr(_DEFAULTS, name))
-            fits = (
-                isinstance(value, int | float) and not isinstance(value, bool) if kind is float else type(value) is kind
-            )
-            if not fits:
-                raise ValueError(f"services.toml: arm: {name} = {value!r}: must be of type {kind.__name__}")
-        settings = cls(**fields)
-        if not 0.0 < settings.speed <= 1.0:
-            raise ValueError(f"services.toml: arm: speed = {settings.speed}: must be above 0 and at most 1")
-        if not settings.stream_period > 0.0:
-            raise ValueError(f"services.toml: arm: stream_period = {settings.stream_period}: must be above 0")
-        return settings
-
-
-_DEFAULTS: Final = Settings()
-
-
 class Arm:
     """Driver of the PUMA (see `services.device.Driver`)."""
 
@@ -94,7 +61,7 @@ class Arm:
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         settings = Settings.parse(config)
         self._ports = ports
-        self.model, cell = _numbers(settings, ports)
+        self.model, cell = numbers(settings, ports)
         self._puma = Puma.of(self.model)
         self._guard = Guard(self._puma, self.model, cell)
         home = self.model.poses["home"]
@@ -103,7 +70,7 @@ class Arm:
         self._full_acceleration = self.model.acceleration.tolist()
         self._steering = Steering(self._guard, self._interceptor.retreat, home, PERIOD, self.model.acceleration)
         self._trajectory = self._steering.trajectory
-        self._master = DriveMaster(_drive_settings(self.model), PERIOD, enable=settings.enable)
+        self._master = DriveMaster(drive_settings(self.model), PERIOD, enable=settings.enable)
         self._setpoint: Setpoint = ports.stream(settings.stream)
         self._bus = ports.can()
         self._follower = Follower(settings.stream_period)
@@ -144,8 +111,9 @@ class Arm:
         except ConnectionError as reason:
             self._master.bus_lost(now, str(reason))
             frames = ()
+        receive = self._master.receive
         for frame in frames:
-            self._master.receive(now, frame)
+            receive(now, frame)
         self._measure()
         self._sense(now)
         self._drive(now)
@@ -338,10 +306,19 @@ class Arm:
         """How far (rad) the measured joints are off the path commanded of late; how late they are on it does not count."""
         if self._mode == "off" or not self._commanded:
             return 0.0
-        least, before = math.inf, None
+        least, before, measured = math.inf, None, self._measured
         for q in self._commanded:
-            if q is not before:  # the same one cycle after cycle while the arm stands
-                least, before = min(least, self._off_by(q)), q
+            if q is before:  # the same one cycle after cycle while the arm stands
+                continue
+            before, farthest = q, 0.0
+            for a, b in zip(q, measured, strict=True):
+                off = a - b if a > b else b - a
+                if off > farthest:
+                    farthest = off
+                    if off >= least:  # most often by the first joint
+                        break
+            else:
+                least = farthest
         return least
 
     def _lost(self) -> bool:
@@ -366,17 +343,6 @@ class Arm:
 
 _STANDING: Final = 0.01
 """rad/s below which a joint counts as standing."""
-
-
-def _numbers(settings: Settings, ports: Ports) -> tuple[ArmModel, Cell]:
-    """The arm and the cell: the package's own, or those of the files that the settings name."""
-    model = read_arm(ports.file(settings.model).decode()) if settings.model else nominal_arm()
-    return model, (read_cell(ports.file(settings.cell).decode()) if settings.cell else nominal_cell())
-
-
-def _drive_settings(model: ArmModel) -> list[DriveSettings]:
-    limits = zip(model.lower.tolist(), model.upper.tolist(), model.acceleration.tolist(), strict=True)
-    return [DriveSettings(lower, upper, acceleration) for lower, upper, acceleration in limits]
 
 
 def _share(value: Any) -> float:

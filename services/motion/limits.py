@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from operator import sub
 from typing import NamedTuple
 
 from services.motion.kinematics import Puma
@@ -65,6 +66,8 @@ class Guard:
         self._above_table = cell.table_top + arm_margin
         self._above_pedestal = max(puma.d1 + self._body.base, self._above_table, arm_margin)
         self._beside_pedestal = self._body.base + self._body.wrist + arm_margin
+        self._vouched: list[float] | None = None
+        """Where `advance` left a trajectory, if it let it go on: the very list, so another trajectory's is never meant."""
 
     def closer(self, share: float) -> Guard:
         """A guard that keeps only a share of the margins."""
@@ -173,11 +176,18 @@ class Guard:
         q, qd = trajectory.proposed()
         rest = trajectory.resting(q, qd)
         refused = self.violation(rest)
-        if any(abs(b - a) > NEAR for a, b in zip(q, rest, strict=True)):
-            for share in LOOKS:
-                refused = refused or self.violation(trajectory.stopping(q, qd, share))
-        trajectory.accept(*(trajectory.braking() if refused else (q, qd)))
+        if not refused and max(map(abs, map(sub, rest, q))) > NEAR:
+            refused = next(filter(None, map(self.violation, trajectory.stopping(q, qd, *LOOKS))), "")
+        if refused:
+            q, qd = trajectory.braking()
+        else:
+            self._vouched = q
+        trajectory.accept(q, qd)
         return refused
+
+    def stops_clear(self, trajectory: Trajectory) -> bool:
+        """Whether the pose in which the trajectory comes to rest is clear; known at once if `advance` has just found it so."""
+        return trajectory.q is self._vouched or not self.violation(trajectory.resting(trajectory.q, trajectory.qd))
 
 
 class _Turn:

@@ -82,7 +82,8 @@ class Steering:
         self._cycles += 1
         trajectory = self.trajectory
         if braking or self.goal is None:
-            trajectory.accept(*trajectory.braking())
+            if not trajectory.still:
+                trajectory.accept(*trajectory.braking())
             return
         if self._via is not None and self._cycles % LOOK == 0:
             self._look_again(self.goal)
@@ -96,10 +97,10 @@ class Steering:
     def _guarded(self) -> str:
         """One step past the guard that the arm's present way to rest satisfies; on a way round the closer one. An arm that was
         switched on where neither is satisfied may leave, creeping."""
-        trajectory, rest = self.trajectory, self._rest()
-        if self._via is None and not self._creeps and not self._guard.violation(rest):
+        trajectory = self.trajectory
+        if self._via is None and not self._creeps and self._guard.stops_clear(trajectory):
             return self._guard.advance(trajectory)
-        if not self._close_guard.violation(rest):
+        if self._close_guard.stops_clear(trajectory):
             if self._creeps:
                 self._creeps = False
                 self._choose_limits()

@@ -11,7 +11,7 @@ Plain floats, not arrays: six joints a cycle are too few for numpy to pay.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -31,9 +31,12 @@ def next_velocity(error: float, velocity: float, period: float, speed: float, ac
     if size < RESIDUE and abs(velocity) <= quantum:
         return 0.0
     cycles = math.ceil(0.5 * (math.sqrt(1.0 + 4.0 * size) - 1.0) - ROUNDING)
-    wish = size / (cycles + 1.0) if size > cycles * cycles - 1.0 else cycles - 1.0
-    wish = math.copysign(min(wish * quantum, speed), left)
-    return min(max(wish, velocity - quantum), velocity + quantum)
+    wish = quantum * (size / (cycles + 1.0) if size > cycles * cycles - 1.0 else cycles - 1.0)
+    # comparisons, not min and max: this is asked for six joints in every cycle
+    wish = wish if wish < speed else speed
+    wish = wish if left >= 0.0 else -wish
+    least, most = velocity - quantum, velocity + quantum
+    return least if wish < least else most if wish > most else wish
 
 
 RESIDUE = 1e-6
@@ -142,16 +145,22 @@ class Trajectory:
     def resting(self, q: Sequence[float], qd: Sequence[float]) -> list[float]:
         """Where all joints come to rest if they brake from here."""
         period = self.period
-        return [angle + braking_distance(v, period, a) for angle, v, a in zip(q, qd, self._brakes, strict=True)]
-
-    def stopping(self, q: Sequence[float], qd: Sequence[float], share: float) -> list[float]:
-        """Where the joints are after a share of the time that braking from here takes, the slowest joint deciding."""
-        times = [self.period * braking_cycles(v, self.period, a) for v, a in zip(qd, self._brakes, strict=True)]
-        now = share * max(times)
         return [
-            angle + v * (min(now, time) - 0.5 * min(now, time) ** 2 / time if time else 0.0)
-            for angle, v, time in zip(q, qd, times, strict=True)
+            angle + braking_distance(v, period, a) if v else angle
+            for angle, v, a in zip(q, qd, self._brakes, strict=True)
         ]
+
+    def stopping(self, q: Sequence[float], qd: Sequence[float], *shares: float) -> Iterator[list[float]]:
+        """Where the joints are after shares of the time that braking from here takes, the slowest joint deciding."""
+        period = self.period
+        times = [period * braking_cycles(v, period, a) for v, a in zip(qd, self._brakes, strict=True)]
+        longest = max(times)
+        for share in shares:
+            now = share * longest
+            yield [
+                angle + v * (now - 0.5 * now**2 / time if now < time else 0.5 * time) if time else angle
+                for angle, v, time in zip(q, qd, times, strict=True)
+            ]
 
     def accept(self, q: list[float], qd: list[float]) -> None:
         """Make a proposed or braking state the present one."""

@@ -12,7 +12,7 @@ from services.comm import canopen
 from services.comm.canbus import Frame
 from services.comm.canopen import Abort, NmtCommand, NmtState, SdoAbortError, SdoClient, Transfer, Type
 from services.comm.cia402 import RECEIVED, SENT, Command, Fault, Object, State, from_units, state_of, to_units
-from services.motion.drive_master import DriveLink, DriveSettings
+from services.motion.drive_link import DriveLink, DriveSettings
 from sim.drives import DriveBus, ratings
 
 TPDO, RPDO = canopen.pdo_struct(SENT), canopen.pdo_struct(RECEIVED)

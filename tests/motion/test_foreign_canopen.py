@@ -16,7 +16,8 @@ import pytest
 from services.comm.can_hub import Hub
 from services.comm.canbus import Frame
 from services.comm.cia402 import Command, Fault, Object, State, command_of, from_units
-from services.motion.drive_master import DriveMaster, DriveSettings, Phase
+from services.motion.drive_link import DriveSettings
+from services.motion.drive_master import DriveMaster, Phase
 from sim.drives import DriveBus, ratings
 
 canopen: Any = importlib.import_module("canopen")  # it has no annotations worth the name

@@ -78,7 +78,7 @@ def test_braking_ends_where_it_was_said_to_end(target: list[float], cycles: int)
         trajectory.accept(*trajectory.braking())
         path.append(trajectory.q)
     for number, pose in enumerate(path):
-        assert np.allclose(trajectory.stopping(q, qd, number / max(len(path) - 1, 1)), pose, atol=1e-9)
+        assert np.allclose(next(trajectory.stopping(q, qd, number / max(len(path) - 1, 1))), pose, atol=1e-9)
     assert trajectory.still
     assert np.allclose(trajectory.q, rest, atol=1e-9)
 

@@ -1,0 +1,175 @@
+"""What the master knows of one drive: its configuration, what it says in its TPDO, and the RPDO that it is sent."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from services.comm import canopen
+from services.comm.canbus import Frame
+from services.comm.canopen import SdoClient, Transfer, Type
+from services.comm.cia402 import (
+    DEVICE_TYPE,
+    ENABLING,
+    RECEIVED,
+    SENT,
+    SUPPORTED_MODES,
+    Command,
+    Mode,
+    Object,
+    State,
+    StatusBit,
+    from_units,
+    state_of,
+    to_units,
+)
+
+MASTER_NODE: Final = 0x7F
+"""Node id under which the master sends its own heartbeat."""
+HEARTBEAT_MS: Final = 50
+"""Period of everybody's heartbeat."""
+HEARTBEAT_PATIENCE_MS: Final = 200
+"""Silence after which a node counts as lost (both ways)."""
+RESET_CYCLES: Final = 10
+"""Cycles between two fault resets."""
+STOP_CYCLES: Final = 125
+"""Cycles that a drive is given to stop quickly and stand, before its power is taken away and its brake holds."""
+SPEED_POLL: Final = 1.0
+"""Seconds between two looks at a drive's greatest speed."""
+LIMITED_POLL: Final = 0.02
+"""The same while a drive says that it is too slow for its set points."""
+
+_U8, _U16, _U32, _I8, _I32 = Type.UNSIGNED8, Type.UNSIGNED16, Type.UNSIGNED32, Type.INTEGER8, Type.INTEGER32
+_TPDO: Final = canopen.pdo_struct(SENT)
+_RPDO: Final = canopen.pdo_struct(RECEIVED)
+
+
+@dataclass(frozen=True, slots=True)
+class DriveSettings:
+    """What a drive is configured with: SI units."""
+
+    lower: float
+    upper: float
+    quick_stop: float
+    following_error: float = 0.10
+    following_time: float = 0.04
+
+
+class DriveLink:
+    """What the master knows of one drive."""
+
+    def __init__(self, node: int, settings: DriveSettings) -> None:
+        self.node = node
+        self.settings = settings
+        self.sdo = SdoClient(node)
+        self.state = State.NOT_READY_TO_SWITCH_ON
+        self.statusword = 0
+        self.limited = False
+        """Whether the drive cuts its set points because they are faster than it goes."""
+        self.position = 0.0
+        self.torque = 0.0
+        self.silent = 0
+        self.spoken = False
+        self.max_speed = 0.0
+        self.error_code = 0
+        self.controlword = 0
+        self._asked = 0.2 * node  # not all at once
+        self._reading = False
+        self._taken = b""
+        self._rpdo = canopen.RPDO1_BASE + node
+        self._sent: tuple[int, float, Frame] | None = None
+        self._wait = 0
+        self._stopping = 0
+
+    def transfers(self, cycle: float) -> list[Transfer]:
+        """The configuration of this drive for a bus cycle of so many seconds, and what is read from it."""
+        beat = MASTER_NODE << 16 | HEARTBEAT_PATIENCE_MS
+        settings = self.settings
+        return [
+            Transfer(Object.DEVICE_TYPE, 0, _U32),
+            Transfer(Object.SUPPORTED_MODES, 0, _U32),
+            Transfer(Object.MAX_SPEED, 0, _U32),
+            Transfer(Object.PRODUCER_HEARTBEAT, 0, _U16, HEARTBEAT_MS),
+            Transfer(Object.CONSUMER_HEARTBEAT, 1, _U32, beat),
+            Transfer(Object.SYNC_PERIOD, 0, _U32, round(cycle * 1e6)),
+            Transfer(Object.MODE, 0, _I8, Mode.CYCLIC_SYNCHRONOUS_POSITION),
+            Transfer(Object.INTERPOLATION_PERIOD, 1, _U8, round(cycle * 1e3)),
+            Transfer(Object.INTERPOLATION_PERIOD, 2, _I8, -3),
+            Transfer(Object.SOFTWARE_LIMITS, 1, _I32, to_units(settings.lower)),
+            Transfer(Object.SOFTWARE_LIMITS, 2, _I32, to_units(settings.upper)),
+            Transfer(Object.FOLLOWING_ERROR_WINDOW, 0, _U32, to_units(settings.following_error)),
+            Transfer(Object.FOLLOWING_ERROR_TIMEOUT, 0, _U16, round(settings.following_time * 1e3)),
+            Transfer(Object.QUICK_STOP_DECELERATION, 0, _U32, to_units(settings.quick_stop)),
+            *canopen.map_pdo(Object.RPDO1, Object.RPDO1_MAPPING, canopen.RPDO1_BASE + self.node, 1, RECEIVED),
+            *canopen.map_pdo(Object.TPDO1, Object.TPDO1_MAPPING, canopen.TPDO1_BASE + self.node, 1, SENT),
+        ]
+
+    def wrong(self) -> str:
+        """What makes the device at this node unfit, in words; empty if nothing. Takes over its greatest speed."""
+        device, modes = self.sdo.results[Object.DEVICE_TYPE, 0], self.sdo.results[Object.SUPPORTED_MODES, 0]
+        if device != DEVICE_TYPE:
+            return f"node {self.node} is no servo drive (object 1000h is {device:#010x}): check the node ids"
+        if not modes & SUPPORTED_MODES:
+            return f"node {self.node} does not know cyclic synchronous position"
+        self.max_speed = from_units(self.sdo.results[Object.MAX_SPEED, 0])
+        return ""
+
+    def ask_speed(self, now: float, hurry: bool) -> list[Frame]:
+        """Read the drive's greatest speed again when it is time, sooner in a hurry: drives may slow down by themselves."""
+        if self._reading:
+            if self.sdo.busy:
+                return self.sdo.advance(now)
+            self._reading = False
+            self.max_speed = from_units(self.sdo.results.get((Object.MAX_SPEED, 0), to_units(self.max_speed)))
+        if now - self._asked < (LIMITED_POLL if hurry else SPEED_POLL):
+            return []
+        self._asked, self._reading = now, True
+        self.sdo.begin([Transfer(Object.MAX_SPEED, 0, _U32)])
+        return self.sdo.advance(now)
+
+    def take(self, data: bytes) -> bool:
+        """The drive's TPDO; says whether its status is another one. Raises ValueError for bytes that are none."""
+        if data == self._taken and self.spoken:  # a drive at rest
+            self.silent = 0
+            return False
+        if len(data) != _TPDO.size:
+            raise ValueError(f"TPDO of node {self.node} has {len(data)} bytes, must have {_TPDO.size}")
+        statusword, position, torque = _TPDO.unpack(data)
+        other = statusword != self.statusword or not self.spoken
+        if other:
+            self.state, self.statusword = state_of(statusword), statusword
+            self.limited = bool(statusword & StatusBit.INTERNAL_LIMIT)
+        self.position, self.torque = from_units(position), torque / 1e3
+        self.silent, self.spoken, self._taken = 0, True, data
+        return other
+
+    def frame(self, target: float, wanted: bool, resetting: bool) -> Frame:
+        """The RPDO: a controlword that leads to where the master wants the drive, and the target position (rad)."""
+        self._stopping = 0 if wanted else self._stopping + 1
+        if wanted and self.state is State.OPERATION_ENABLED:
+            self.controlword = _GO_ON
+        else:
+            self.controlword = self._command(wanted, resetting).word
+        return self._frame(self.controlword, target)
+
+    def _frame(self, controlword: int, target: float) -> Frame:
+        """The RPDO; the same object as before while neither of both changes."""
+        sent = self._sent
+        if sent is None or target != sent[1] or controlword != sent[0]:
+            frame = Frame(self._rpdo, _RPDO.pack(controlword, to_units(target)))
+            self._sent = sent = controlword, target, frame
+        return sent[2]
+
+    def _command(self, wanted: bool, resetting: bool) -> Command:
+        if not wanted:
+            brakes = self.state in _MOVING and self._stopping <= STOP_CYCLES
+            return Command.QUICK_STOP if brakes else Command.DISABLE_VOLTAGE
+        if self.state is State.FAULT:
+            self._wait = (self._wait + 1) % RESET_CYCLES
+            return Command.FAULT_RESET if resetting and self._wait == 1 else Command.DISABLE_VOLTAGE
+        return ENABLING.get(self.state, Command.DISABLE_VOLTAGE)
+
+
+_MOVING: Final = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE)
+_GO_ON: Final = ENABLING[State.OPERATION_ENABLED].word
+"""Controlword to a drive that follows its set points."""
