@@ -13,6 +13,7 @@ import numpy as np
 
 from services.comm import messages as m
 from services.comm.canbus import Frame
+from services.comm.frequent import COUNT_END, EXECUTED, NAME_LENGTH, READERS, WRITERS
 from services.comm.messages import Executed, Message, Tick
 from services.comm.party import Envelope, Posted
 from services.comm.plain import NotPlainError, inspect, pack_array, unpack_array
@@ -46,13 +47,9 @@ LIMITS: Mapping[int, int] = {
 }
 """Largest body of each kind (bytes), the MAC not counted."""
 
-NAME_LENGTH = 255
-"""Longest name, id or code (characters)."""
 MAX_CONTAINERS = 100_000
 """Most arrays and maps in one message: one byte each on the wire, some 70 in memory."""
 _UNCOUNTED = 64 * KIB
-_COUNT_END = 2**63
-_EXECUTED = {str(one): one for one in Executed}
 _ARRAY, _MESSAGE = 1, 2
 """msgpack extension types inside Tick: an array of numbers, a message."""
 
@@ -78,7 +75,7 @@ def _name(value: str) -> str:
 
 
 def _count(value: int) -> int:
-    if not 0 <= value < _COUNT_END:
+    if not 0 <= value < COUNT_END:
         raise _FieldError("not from 0 to 2^63 - 1")
     return value
 
@@ -115,7 +112,7 @@ def _numbers(value: list[Any]) -> tuple[float, ...]:
 
 
 def _executed(value: str) -> Executed:
-    found = _EXECUTED.get(value)
+    found = EXECUTED.get(value)
     if found is None:
         raise _FieldError("not yes, no or unknown")
     return found
@@ -200,18 +197,22 @@ def _reader(names: list[str]) -> Callable[[Any], tuple[Any, ...]]:
 
 _SPECS: dict[int, _Spec] = {cls.KIND: _Spec(cls) for cls in get_args(Message)}
 _LEAVES: frozenset[type] = frozenset((np.ndarray, *get_args(Message)))
-_packer = msgpack.Packer(buf_size=64 * KIB)
+_pack = msgpack.Packer(buf_size=64 * KIB).pack
+_unpackb = msgpack.unpackb
 
 
 def encode(message: Message) -> bytes:
     """Body of a frame, without length and MAC. Raises ProtocolError if the message is no message or too large."""
     kind = message.KIND
     spec = _SPECS[kind]
+    writer = WRITERS.get(kind)
     try:
-        if kind == Tick.KIND:
-            body: bytes = msgpack.packb([kind, *_tick_out(message)], default=_extension)
+        if writer is not None:
+            body: bytes = _pack(writer(message))
+        elif kind == Tick.KIND:
+            body = msgpack.packb([kind, *_tick_out(message)], default=_extension)
         else:
-            body = _packer.pack([kind, *spec.read(message)])
+            body = _pack([kind, *spec.read(message)])
     except (TypeError, ValueError, OverflowError) as fault:
         raise ProtocolError("unencodable", f"{type(message).__name__}: {fault}") from None
     if len(body) > spec.limit:
@@ -266,17 +267,17 @@ def decode(body: bytes | memoryview) -> Message:
 def decode_kind(body: bytes | memoryview, kind: int) -> Message:
     """`decode` of a body whose kind and length have been checked."""
     spec = _SPECS[kind]
-    index = 0
+    size = len(body)
+    index = 2  # the map: all that a reader can find fault with
     try:
-        fields = _unpack(body, kind)
-        if len(body) <= NAME_LENGTH and kind in _QUICK and len(fields) == 9:
-            message = _QUICK[kind](*fields)
-            if message is not None:
-                return message
+        fields = _unpack(body, kind, size)
+        reader = READERS.get(kind)
+        if reader is not None and (message := reader(fields, size <= NAME_LENGTH)) is not None:
+            return message
         del fields[0]
         if tuple(map(type, fields)) != spec.types:
             _other_types(spec, fields)
-        for index, check in spec.checks if len(body) <= NAME_LENGTH else spec.long_checks:
+        for index, check in spec.checks if size <= NAME_LENGTH else spec.long_checks:
             fields[index] = check(fields[index])
     except _FieldError as fault:
         raise ProtocolError("malformed", f"kind {kind}: {fault}") from None
@@ -301,58 +302,16 @@ class _Counter:
         return container
 
 
-def _quick_call(
-    kind: int, id_: Any, service: Any, arguments: Any, deadline: Any, epoch: Any, boot: Any, parent: Any, seed: Any
-) -> Message | None:
-    """A Call whose fields are of the usual types and ranges, else None: the table's checks in one place, for speed."""
-    if (
-        type(id_) is type(service) is type(boot) is type(parent) is str
-        and type(arguments) is dict
-        and (deadline is None or (type(deadline) is float and 0.0 <= deadline < math.inf))
-        and type(epoch) is type(seed) is int
-        and 0 <= epoch < _COUNT_END
-        and 0 <= seed < _COUNT_END
-    ):
-        if arguments:
-            inspect(arguments)
-        return m.Call(id_, service, arguments, deadline, epoch, boot, parent, seed)
-    return None
-
-
-def _quick_outcome(
-    kind: int, id_: Any, status: Any, values: Any, cause: Any, text: Any, executed: Any, took: Any, cpu: Any
-) -> Message | None:
-    """An Outcome, as `_quick_call`."""
-    if (
-        type(id_) is type(status) is type(cause) is type(text) is type(executed) is str
-        and type(values) is dict
-        and executed in _EXECUTED
-        and type(took) is type(cpu) is float
-        and 0.0 <= took < math.inf
-        and 0.0 <= cpu < math.inf
-    ):
-        if values:
-            inspect(values)
-        return m.Outcome(id_, status, values, cause, text, _EXECUTED[executed], took, cpu)
-    return None
-
-
-_QUICK: Mapping[int, Callable[..., Message | None]] = {m.Call.KIND: _quick_call, m.Outcome.KIND: _quick_outcome}
-"""The two kinds that make up nearly all traffic."""
-
-
-def _unpack(body: bytes | memoryview, kind: int) -> list[Any]:
+def _unpack(body: bytes | memoryview, kind: int, size: int) -> list[Any]:
     try:
-        if len(body) <= _UNCOUNTED and kind != Tick.KIND:
-            fields = msgpack.unpackb(body, ext_hook=_no_extension)
-        else:
-            fields = _unpack_counted(body, kind)
+        if size <= _UNCOUNTED and kind != Tick.KIND:
+            return _unpackb(body, ext_hook=_no_extension)  # type: ignore[no-any-return]  # an array: `kind_of` saw its head
+        return list(_unpack_counted(body, kind))
     except (_FieldError, NotPlainError, ProtocolError) as fault:
         raise _FieldError(str(fault)) from None
     except Exception as fault:
         # msgpack raises its own kinds, ValueError, UnicodeDecodeError and RecursionError on bad bytes.
         raise _FieldError(f"not msgpack: {type(fault).__name__}") from None
-    return fields if type(fields) is list else list(fields)
 
 
 def _unpack_counted(body: bytes | memoryview, kind: int) -> Any:

