@@ -11,7 +11,7 @@ from __future__ import annotations
 import asyncio
 import secrets
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -134,29 +134,34 @@ class EmergencyLine:
 
 
 async def order_all(
-    directory: Directory, credentials: Credentials, verb: str = STOP, *, bus: Callable[[str], bool] | None = None
+    directory: Directory, credentials: Credentials, verb: str = STOP, *, bus: bool = False
 ) -> list[Stopped]:
-    """Give an order to every node that owns devices, all at once. `bus(node)`: whether to stop its bus in any case."""
+    """Give an order to every node that owns devices, all at once; with `bus` stop their buses without waiting for them."""
     nodes = nodes_with_devices(directory)
     return list(await asyncio.gather(*(_order(directory, credentials, n, verb, bus) for n in nodes)))
 
 
-async def _order(
-    directory: Directory, credentials: Credentials, node: str, verb: str, bus: Callable[[str], bool] | None
-) -> Stopped:
+async def _order(directory: Directory, credentials: Credentials, node: str, verb: str, bus: bool) -> Stopped:
     stopped = Stopped(node)
     line = EmergencyLine(directory, node, credentials)
     asking = asyncio.create_task(_ask(line, stopped, verb))
     try:
         if verb == STOP:
-            wait = 0.0 if bus is not None and bus(node) else NODE_LATE
-            await asyncio.wait({asking}, timeout=wait)
-            if not stopped.answered or not wait:
+            if not bus:
+                await _answered(stopped, asking, NODE_LATE)
+            if bus or not stopped.answered:
                 stopped.bus = await _stop_buses(directory, node)
         await asking
     finally:
         await line.close()
     return stopped
+
+
+async def _answered(stopped: Stopped, asking: asyncio.Task[None], timeout: float) -> None:
+    """Wait for the node's first answer, at most so many seconds."""
+    deadline = asyncio.get_running_loop().time() + timeout
+    while not stopped.answered and not asking.done() and asyncio.get_running_loop().time() < deadline:
+        await asyncio.wait({asking}, timeout=ASK_AGAIN)
 
 
 async def _ask(line: EmergencyLine, stopped: Stopped, verb: str) -> None:

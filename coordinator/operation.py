@@ -145,10 +145,26 @@ class Operation:
 
     async def _do_pause(self, who: str, data: Mapping[str, Any]) -> Answer:
         answer = self._order(Pause(f"by {who}"))
-        await self._until(
-            lambda: not any(run["state"] == "holding" for run in self.feed.state["runs"].values()), ANSWERS
-        )
+        if answer["ok"]:
+            await self._until(lambda: not self._holding(), ANSWERS)
+            self._complete_pause()
         return {**answer, "nodes": dict((self.feed.state["paused"] or {}).get("nodes", {}))}
+
+    def _holding(self) -> list[str]:
+        """Nodes that have been asked to hold a run and have not answered."""
+        return [run["node"] for run in self.feed.state["runs"].values() if run["state"] == "holding"]
+
+    def _complete_pause(self) -> None:
+        """Say of every node with devices how it is: `lost` if it did not answer, `idle` if it had nothing to hold."""
+        paused = self.feed.state["paused"]
+        if paused is None:
+            return
+        directory, late = self.executor.directory, self._holding()
+        owners = {device.node for device in directory.devices.values() if device.driver}
+        nodes = {node: "lost" if node in self.mission.lost else "idle" for node in directory.nodes if node in owners}
+        nodes |= paused["nodes"] | dict.fromkeys(late, "lost")
+        if nodes != paused["nodes"]:
+            self.feed.emit("paused", paused={**paused, "nodes": nodes})
 
     async def _do_resume(self, who: str, data: Mapping[str, Any]) -> Answer:
         return self._order(Resume())
@@ -206,7 +222,7 @@ class Operation:
 
     async def _do_estop(self, who: str, data: Mapping[str, Any]) -> Answer:
         for node in self.mission.callers:
-            self._ask_node(node, "stop")
+            self._ask_node(node, "emergency_stop")
         answer = self._order(Abort(f"emergency stop by {who}"))
         self.feed.emit("mission", mission={"state": "stopped", "reason": f"emergency stop by {who}"})
         return answer if answer["ok"] or answer["code"] != "idle" else {"ok": True}

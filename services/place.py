@@ -140,7 +140,10 @@ class InlinePlace:
 
     def advance(self, now: float) -> None:
         """Runs first, then as many cycles of the driver as are due."""
+        held = self._runner.held and bool(self._runner.runs)
         self._runner.advance(now)
+        if held and not self._runner.runs:
+            self._carry_out(now, "release")  # what was held is over
         if self._cyclic is None or self._driver is None or not self._driver.period:
             return
         due = now if self._next_step is None else self._next_step

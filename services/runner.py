@@ -78,6 +78,11 @@ class Runner:
         return any(run.polls for run in self._runs.values())
 
     @property
+    def held(self) -> bool:
+        """Whether the operator holds the runs."""
+        return self._held_since is not None
+
+    @property
     def fenced(self) -> bool:
         """Whether the device is not known to stand still after a run that had to be given up."""
         return self._fenced
@@ -241,6 +246,8 @@ class Runner:
             self._drop(run, cause, text)
         elif run.phase not in _AFTER:
             run.cause, run.text, run.result, run.limit = cause, text, None, now + GRACE
+            # A held device stands without having been stopped: released, it would go on without its run.
+            run.abandoned = self.held
             self._outlets.close(run.begin.id)
             run.phase = Phase.SETTLING if run.over else Phase.STOPPING
             if not run.over:

@@ -168,6 +168,7 @@ class WorkerPlace:
             if isinstance(report, Ended):
                 if self._runs.pop(report.id, None) is not None:
                     self._reports.append(report)
+                    self._release_if_over()
             elif isinstance(report, Told):
                 self._told(report)
             else:
@@ -226,6 +227,7 @@ class WorkerPlace:
             text = f"{end.text}; {note}" if note else end.text
             self._reports.append(Ended(end.id, end.status, {}, end.cause, text, end.executed, end.seconds))
         self._lost, self._halt_due = [], None
+        self._release_if_over()
         self._changed()
 
     def take(self, now: float, order: Order) -> None:
@@ -331,6 +333,14 @@ class WorkerPlace:
             self._frozen_since = None
         if self._cyclic and self._worker is not None:
             self._worker.post(flat(Hold(frozen)))
+
+    def _release_if_over(self) -> None:
+        """The last of the held runs has ended, its device was stopped: the next one must not find it held."""
+        if self._runs or self._frozen_since is None:
+            return
+        self._freeze(False)
+        if self._cyclic and self._owner is not None:
+            self._owner.post([COMMAND, "", "release"])
 
     def _told(self, told: Told) -> None:
         if told.id.startswith(HALT):

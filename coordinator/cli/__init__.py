@@ -28,11 +28,24 @@ class Command:
 
     name: str
     summary: str
+    module: str = ""
+    """Under `coordinator.cli`; empty: that of its name."""
 
 
 COMMANDS = (
     Command("run", "run a task"),
     Command("resume", "go on with a run whose coordinator was killed"),
+    Command("watch", "follow the run that goes on", "operate.watch"),
+    Command("pause", "pause it; every node says whether its devices hold", "operate.pause"),
+    Command("continue", "let it go on", "operate.go_on"),
+    Command("step", "let it go on for one firing", "operate.step"),
+    Command("break", "pause it before a transition or at a place", "operate.breakpoints"),
+    Command("token", "put tokens into a control place, or take some out", "operate.tokens"),
+    Command("raise", "raise an external event by hand", "operate.events"),
+    Command("force", "leave an action place whatever its run does", "operate.force"),
+    Command("override", "choose the alternative of a primitive task by hand", "operate.override"),
+    Command("abort", "give it up", "operate.abort"),
+    Command("estop", "emergency stop, straight to the nodes and their bus"),
     Command("log", "print or export a recorded run"),
     Command("campaign", "run a task many times in parallel lock-step cells"),
     Command("learned", "what was learned: show, merge, freeze, reset an estimates file"),
@@ -86,7 +99,7 @@ def _overview(arguments: Sequence[str]) -> int:
 
 
 def _dispatch(command: Command, arguments: Sequence[str]) -> int:
-    module = importlib.import_module(f"coordinator.cli.{command.name}")
+    module = importlib.import_module(f"coordinator.cli.{command.module or command.name}")
     parser = argparse.ArgumentParser(
         prog=f"petrobot {command.name}",
         description=module.__doc__,

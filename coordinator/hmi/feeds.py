@@ -50,4 +50,5 @@ async def _command(request: web.Request) -> web.Response:
         raise web.HTTPBadRequest(text="data is an object")
     who = who_is(str(body.get("name", "script")), house.doors.pass_value)
     answer = await carry_out(house.port, who, str(body.get("verb")), data)
+    house.heard(who)
     return json_answer(answer, 200 if answer.get("ok") else 409)

@@ -18,6 +18,8 @@ from coordinator.hmi.store import TaskStore
 
 ABSENT_S = 10.0
 """Controls go free when their holder's last window has been gone for so long."""
+CLOCK_S = 0.05
+"""How much too early a timer of the loop may come."""
 ENCODED_KEPT = 8
 
 
@@ -34,6 +36,7 @@ class House:
     sessions: set[Session] = field(default_factory=set)
     commands: set[asyncio.Task[None]] = field(default_factory=set)
     closing: bool = False
+    _heard: dict[str, float] = field(default_factory=dict)
     _encoded: OrderedDict[tuple[int, int], str] = field(default_factory=OrderedDict)
 
     def encode_once(self, delta: dict[str, Any]) -> str:
@@ -52,7 +55,16 @@ class House:
         if session.who and not self.closing:
             asyncio.get_running_loop().call_later(ABSENT_S, self._free_controls, session.who)
 
+    def heard(self, who: str) -> None:
+        """A script gave a command: if it holds the controls and gives none for a while, they go free."""
+        loop = asyncio.get_running_loop()
+        self._heard[who] = loop.time()
+        loop.call_later(ABSENT_S, self._free_controls, who)
+
     def _free_controls(self, who: str) -> None:
+        if asyncio.get_running_loop().time() < self._heard.get(who, -ABSENT_S) + ABSENT_S - CLOCK_S:
+            return  # it has been heard again since
+        self._heard.pop(who, None)
         if self.closing or any(session.who == who for session in self.sessions):
             return
         if self.port.snapshot().get("controls", {}).get("holder") == who:

@@ -13,6 +13,7 @@ from coordinator.engine import (
     EventOccurred,
     Finished,
     Fired,
+    Hold,
     HoldRun,
     Instruction,
     Marked,
@@ -38,6 +39,7 @@ from coordinator.net import Marking
 from coordinator.task import End, Scope, Task
 from services.comm.notice import Progress
 
+_AFTER_HOLD = {Hold.HELD: "held", Hold.CANNOT: "running", Hold.STOPPED: "stopping"}
 _LEVEL = {Severity.NOTE: "info", Severity.WARNING: "warning", Severity.ERROR: "error"}
 
 
@@ -205,10 +207,10 @@ class Narrator:
         self.feed.emit("run_progress", time=time, id=run, state=state)
 
     def _answered(self, time: float, held: RunHeld) -> None:
-        if held.answer.value == "held":
-            self._state(time, held.run, "held")
+        self._state(time, held.run, _AFTER_HOLD[held.answer])
         node = self._where.get(self._actions.get(held.run, ""), "?")
-        self._held[node] = held.answer.value
+        before = self._held.get(node, Hold.HELD.value)
+        self._held[node] = before if before == Hold.CANNOT.value else held.answer.value  # the worst of a node's runs
         paused = self.feed.state["paused"]
         if paused is not None:
             self.feed.emit("paused", time=time, paused={**paused, "nodes": dict(self._held)})

@@ -31,6 +31,8 @@ class Page:
         self._listening = listening
         self._house = house
         self.url = url
+        self.base = url.partition("/?")[0]
+        """The address without the token."""
         self.token = house.doors.token
 
     @property
@@ -71,8 +73,9 @@ async def start_page(
     history: HistoryPort | None = None,
     names: Sequence[str] = (),
     tls: ssl.SSLContext | None = None,
+    page: bool = True,
 ) -> Page:
-    """Serve the page of a mission.
+    """Serve the page of a mission; without `page` only the operator's protocol: the WebSocket, snapshot and commands.
 
     `port` 0 takes a free one. `names` are further names under which browsers ask for this server (needed when `host` is
     not loopback). `token` is drawn anew unless given. Raises OSError when the address cannot be bound.
@@ -81,7 +84,7 @@ async def start_page(
     number = listener.getsockname()[1]
     doors = Doors(token or secrets.token_urlsafe(24), number, names_for(host, names), tls is not None)
     house = House(port_object, TaskStore(tasks_folder), doors, offers, history)
-    runner = web.AppRunner(_application(house), access_log=None, keepalive_timeout=30.0, shutdown_timeout=1.0)
+    runner = web.AppRunner(_application(house, page), access_log=None, keepalive_timeout=30.0, shutdown_timeout=1.0)
     await runner.setup()
     assert runner.server is not None
     house.gate = Gate(runner.server)
@@ -105,7 +108,7 @@ def _listen(host: str, port: int) -> sockets.socket:
     return listener
 
 
-def _application(house: House) -> web.Application:
+def _application(house: House, page: bool) -> web.Application:
     @web.middleware
     async def count(request: web.Request, handler: Handler) -> web.StreamResponse:
         if house.gate is not None:
@@ -114,10 +117,11 @@ def _application(house: House) -> web.Application:
 
     app = web.Application(middlewares=[count, middleware(house.doors)], client_max_size=LARGEST_BODY)
     app[HOUSE] = house
-    app.router.add_get("/", _index)
-    app.router.add_static("/page", PAGE_FILES, follow_symlinks=False)
     feeds.add_routes(app)
-    documents.add_routes(app)
+    if page:
+        app.router.add_get("/", _index)
+        app.router.add_static("/page", PAGE_FILES, follow_symlinks=False)
+        documents.add_routes(app)
     return app
 
 

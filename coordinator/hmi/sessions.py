@@ -24,6 +24,8 @@ PACE_S = 0.012
 COMMANDS_AT_ONCE = 8
 MESSAGES_PER_S = 60
 LARGEST_MESSAGE = 256 * 1024
+LARGEST_SNAPSHOT = 64 * 1024 * 1024
+"""For clients: the largest message that the server may send (newest images and all)."""
 
 _NAME = re.compile(r"[^\w .'-]+")
 Encode = Callable[[dict[str, Any]], str]
@@ -86,6 +88,8 @@ class Session:
         """Close the connection in good order, as when the server ends."""
         with contextlib.suppress(Exception):
             async with asyncio.timeout(1.0):
+                if self._pending and not self._pending.stale:
+                    await self._send(self._encoded(self._pending.take()))  # how it ended
                 await self._socket.close(code=WSCloseCode.GOING_AWAY)
 
     def _receive(self, change: dict[str, Any]) -> None:
@@ -160,15 +164,17 @@ class Session:
         quiet = not self._news.is_set()
         self._news.clear()
         answers, self._answers = self._answers, []
-        for answer in answers:
-            await self._send(encode(answer))
+        delta = bool(self._pending) and not self._pending.stale
         if self._pending.stale:
             await self._send_snapshot()
-        elif self._pending:
+        elif delta:
             self.deltas_sent += 1
             await self._send(self._encoded(self._pending.take()))
+        for answer in answers:  # after what the command changed, so that its client has seen that
+            await self._send(encode(answer))
+        if delta:
             await asyncio.sleep(PACE_S)
-        elif quiet:
+        elif quiet and not answers:
             await self._send('{"type":"alive"}')
 
     async def _send_snapshot(self) -> None:

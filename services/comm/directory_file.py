@@ -161,7 +161,9 @@ def read(text: str, source: str, memory: str) -> tuple[Tables, str, list[str]]:
             faults.add(f"links.{name}", f'unknown link; write a channel or "source/target"{nearest(name, CHANNELS)}')
     for name in tables["keys"]:
         if name not in KEYS:
-            faults.add(f"keys.{name}", f'unknown; write file = "cell.key" or certificates = "keys"{nearest(name, KEYS)}')
+            faults.add(
+                f"keys.{name}", f'unknown; write file = "cell.key" or certificates = "keys"{nearest(name, KEYS)}'
+            )
     if len(tables["keys"]) > 1:
         faults.add("keys", "a shared key and certificates; name one of them")
     if not faults.lines:

@@ -1,0 +1,109 @@
+"""Emergency stop: straight to the nodes and their bus, whatever the coordinator does; everybody may say it."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from coordinator.cli import CommandError
+from coordinator.cli.loading import add_services_argument, load_directory, write_json
+
+if TYPE_CHECKING:
+    from coordinator.door_file import Door
+    from coordinator.emergency import Stopped
+
+EXAMPLE = "petrobot estop"
+COORDINATOR_PATIENCE = 1.0
+"""Seconds that the coordinator has to hear of it; the devices have been stopped before it is told."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument(
+        "--clear", action="store_true", help="devices take orders again; nothing moves before an action moves it"
+    )
+    parser.add_argument(
+        "--bus", action="store_true", help="stop the devices on this host's buses, too, without waiting for their node"
+    )
+    parser.add_argument("--run", metavar="RUN", help="the run whose cell is meant (default: the newest that goes on)")
+    parser.add_argument(
+        "--journal",
+        metavar="FOLDER",
+        type=Path,
+        default=Path("runs"),
+        help="where runs are kept (default: %(default)s)",
+    )
+    parser.add_argument("--json", metavar="FILE", help="write the answers as JSON (- for standard output)")
+    add_services_argument(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Stop, or clear; 0 when every node with devices has answered, 3 otherwise."""
+    from coordinator.emergency import CLEAR, STOP, order_all
+    from coordinator.realtime import credentials_of
+    from services.comm.security import KeyFileError
+
+    door = _door(options)
+    path = options.services or (Path(door.services) if door is not None and door.services else None)
+    directory = load_directory(path)
+    verb = CLEAR if options.clear else STOP
+    begun = time.perf_counter()
+    try:
+        answers = asyncio.run(order_all(directory, credentials_of(directory), verb, bus=options.bus))
+    except KeyFileError as fault:
+        raise CommandError(2, str(fault)) from fault
+    took = time.perf_counter() - begun
+    coordinator = asyncio.run(_tell(door)) if door is not None and not options.clear else ""
+    _show(options, answers, coordinator, took)
+    return 0 if answers and all(answer.answered for answer in answers) else 3
+
+
+def _door(options: argparse.Namespace) -> Door | None:
+    """The run that goes on, if one does: it says which cell is meant, and its coordinator is told."""
+    from coordinator.door_file import find_door
+    from coordinator.runfolder import NoRunError
+
+    try:
+        return find_door(options.run, options.journal)
+    except NoRunError as fault:
+        if options.run is not None:
+            raise CommandError(2, str(fault)) from fault
+        return None
+
+
+async def _tell(door: Door) -> str:
+    """Let the coordinator abort its run, so that it does not look for a way around; what came of it, in words."""
+    from coordinator.cli.operate.hand import connect
+    from coordinator.hmi.client import OperatorError
+
+    try:
+        async with asyncio.timeout(COORDINATOR_PATIENCE), connect(door, None) as client:
+            answer = await client.command("estop")
+    except (OperatorError, TimeoutError):
+        return f"{door.run}: the coordinator does not answer"
+    return f"{door.run}: aborted" if answer.get("ok") else f"{door.run}: {answer.get('text')}"
+
+
+def _show(options: argparse.Namespace, answers: list[Stopped], coordinator: str, took: float) -> None:
+    if options.json:
+        data: dict[str, Any] = {"nodes": [asdict(answer) for answer in answers], "coordinator": coordinator}
+        write_json(options.json, {**data, "seconds": round(took, 4)})
+    if options.json == "-":
+        return
+    if not answers:
+        print("no node of this cell owns devices: nothing to stop")
+    for answer in answers:
+        for device, said in answer.devices.items():
+            print(f"{answer.node:12} {device:12} {said}")
+        if not answer.answered:
+            print(f"{answer.node:12} {'':12} NO ANSWER: {answer.why}")
+        if answer.bus:
+            print(f"{answer.node:12} {'':12} {answer.bus}")
+    if coordinator:
+        print(coordinator)
+    if not options.clear:
+        print("`petrobot estop --clear` lets the devices take orders again")

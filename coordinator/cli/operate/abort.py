@@ -1,0 +1,27 @@
+"""Give the run up: its actions are cancelled, their devices stopped, and it ends in ERROR."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from coordinator.cli.operate import hand
+
+if TYPE_CHECKING:
+    from coordinator.hmi.client import OperatorClient
+
+EXAMPLE = "petrobot abort"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    hand.add_arguments(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Abort."""
+    return hand.give(options, "abort", told=_told)
+
+
+async def _told(client: OperatorClient, answer: hand.Answer) -> str:
+    return "aborted: its actions are being stopped"

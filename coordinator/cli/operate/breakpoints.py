@@ -1,0 +1,58 @@
+"""Pause the run before a transition fires or when a token enters a place; without a name, tell where it would."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+from coordinator.cli import CommandError
+from coordinator.cli.operate import hand
+
+if TYPE_CHECKING:
+    from coordinator.hmi.client import OperatorClient
+
+EXAMPLE = "petrobot break start"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument("element", nargs="?", help="a transition or place of the task")
+    parser.add_argument("--off", action="store_true", help="no longer pause there")
+    hand.add_arguments(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Set, clear or tell breakpoints."""
+    if options.element is None:
+        return asyncio.run(_list(options))
+    return hand.give(options, "breakpoint", lambda client: _data(client, options), _told)
+
+
+def _data(client: OperatorClient, options: argparse.Namespace) -> dict[str, Any]:
+    task = client.state["task"] or {"places": [], "transitions": []}
+    kinds = {one["name"]: kind for kind in ("places", "transitions") for one in task[kind]}
+    name = options.element.rpartition(".")[2]
+    return {"element": f"{kinds[hand.named(kinds, name, 'place or transition')]}.{name}", "on": not options.off}
+
+
+async def _told(client: OperatorClient, answer: hand.Answer) -> str:
+    answer["breakpoints"] = client.state["breakpoints"]
+    return _words(client.state["breakpoints"])
+
+
+def _words(breakpoints: list[str]) -> str:
+    return f"breakpoints: {', '.join(breakpoints)}" if breakpoints else "no breakpoints"
+
+
+async def _list(options: argparse.Namespace) -> int:
+    from coordinator.hmi.client import OperatorError
+
+    door = hand.find(options)
+    try:
+        async with hand.connect(door, options.name) as client:
+            breakpoints = client.state["breakpoints"]
+    except OperatorError as fault:
+        raise CommandError(3, f"{door.run}: {fault}") from fault
+    hand.show(options, {"run": door.run, "ok": True, "breakpoints": breakpoints}, _words(breakpoints))
+    return 0

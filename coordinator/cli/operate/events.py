@@ -1,0 +1,32 @@
+"""Raise an external event by hand, in a sensor's place."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from coordinator.cli.operate import hand
+
+if TYPE_CHECKING:
+    from coordinator.hmi.client import OperatorClient
+
+EXAMPLE = "petrobot raise image_tick"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument("event", help="an external event of the task")
+    hand.add_arguments(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Raise."""
+
+    def data(client: OperatorClient) -> dict[str, Any]:
+        external = {name: one for name, one in client.state["events"].items() if one["scope"] == "external"}
+        return {"event": hand.named(external, options.event, "external event")}
+
+    async def told(client: OperatorClient, answer: hand.Answer) -> str:
+        return f"raised {options.event}"
+
+    return hand.give(options, "raise_event", data, told)

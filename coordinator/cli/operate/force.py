@@ -1,0 +1,40 @@
+"""Leave an action place by one of its exits whatever its run does; the run counts neither as success nor as failure."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from coordinator.cli.operate import hand
+
+if TYPE_CHECKING:
+    from coordinator.hmi.client import OperatorClient
+
+EXAMPLE = "petrobot force catch_ball missed"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument("place", help="an action place of the task")
+    parser.add_argument("exit", help="a transition that leaves it")
+    hand.add_arguments(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Force."""
+
+    async def told(client: OperatorClient, answer: hand.Answer) -> str:
+        return f"left {options.place} by {options.exit}"
+
+    return hand.give(options, "force_exit", lambda client: _data(client, options), told)
+
+
+def _data(client: OperatorClient, options: argparse.Namespace) -> dict[str, Any]:
+    arcs = (client.state["task"] or {"arcs": []})["arcs"]
+    exits: dict[str, dict[str, None]] = {}
+    for arc in arcs:
+        if arc["direction"] == "in" and arc.get("end"):
+            exits.setdefault(arc["place"], {})[arc["transition"]] = None
+    place = hand.named(exits, options.place, "action place")
+    run_id = next((run["id"] for run in client.state["runs"].values() if run["place"] == place), "")
+    return {"run": run_id, "transition": hand.named(exits[place], options.exit, f"way out of {place}")}

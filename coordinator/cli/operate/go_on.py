@@ -1,0 +1,27 @@
+"""Let a paused run go on. (`petrobot resume RUN` is for a run whose coordinator was killed.)"""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from coordinator.cli.operate import hand
+
+if TYPE_CHECKING:
+    from coordinator.hmi.client import OperatorClient
+
+EXAMPLE = "petrobot continue"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    hand.add_arguments(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Go on."""
+    return hand.give(options, "resume", told=_told)
+
+
+async def _told(client: OperatorClient, answer: hand.Answer) -> str:
+    return "goes on"

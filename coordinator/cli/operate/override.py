@@ -1,0 +1,40 @@
+"""Choose the alternative of a primitive task by hand, or give the choice back."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from coordinator.cli import CommandError
+from coordinator.cli.operate import hand
+
+if TYPE_CHECKING:
+    from coordinator.hmi.client import OperatorClient
+
+EXAMPLE = "petrobot override track_ball predict_kalman"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument("task", help="a primitive task")
+    parser.add_argument("action", nargs="?", help="the alternative that is run from now on")
+    parser.add_argument("--free", action="store_true", help="let the run choose again")
+    hand.add_arguments(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Override."""
+    if options.free is (options.action is not None):
+        raise CommandError(2, f"name an action for {options.task}, or say --free")
+
+    def data(client: OperatorClient) -> dict[str, Any]:
+        selectors = client.state["selectors"]
+        task = hand.named(selectors, options.task, "primitive task")
+        if options.action is not None:
+            hand.named({one["action"]: one for one in selectors[task]["alternatives"]}, options.action, "alternative")
+        return {"primitive_task": task, "action": options.action}
+
+    async def told(client: OperatorClient, answer: hand.Answer) -> str:
+        return f"{options.task}: {options.action or 'chosen freely again'}"
+
+    return hand.give(options, "override_selector", data, told)

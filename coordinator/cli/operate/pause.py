@@ -1,0 +1,36 @@
+"""Pause the run that goes on: nothing fires or starts, and every node says whether its devices hold."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from coordinator.cli.operate import hand
+
+if TYPE_CHECKING:
+    from coordinator.hmi.client import OperatorClient
+
+EXAMPLE = "petrobot pause"
+WORDS = {
+    "held": "holds",
+    "cannot_hold": "CANNOT HOLD: its action goes on",
+    "stopped": "stands still",
+    "idle": "has nothing to do",
+    "lost": "DID NOT ANSWER",
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    hand.add_arguments(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Pause."""
+    return hand.give(options, "pause", told=_told)
+
+
+async def _told(client: OperatorClient, answer: hand.Answer) -> str:
+    nodes = answer.get("nodes", {})
+    lines = [f"  {node:12} {WORDS.get(said, said)}" for node, said in nodes.items()]
+    return "\n".join(["paused; `petrobot continue` goes on, `petrobot step` fires once", *lines])

@@ -1,0 +1,42 @@
+"""Put tokens into a control place, or take some out: more or fewer runs, another path."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from coordinator.cli.operate import hand
+
+if TYPE_CHECKING:
+    from coordinator.hmi.client import OperatorClient
+
+EXAMPLE = "petrobot token runs +2"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument("place", help="a control place of the task")
+    parser.add_argument("tokens", type=_change, help="how many more (+2) or fewer (-1)")
+    hand.add_arguments(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Add or remove."""
+    verb = "add_tokens" if options.tokens > 0 else "remove_tokens"
+
+    def data(client: OperatorClient) -> dict[str, Any]:
+        place = hand.named(client.state["marking"], options.place, "place")
+        return {"place": place, "count": abs(options.tokens)}
+
+    async def told(client: OperatorClient, answer: hand.Answer) -> str:
+        answer["tokens"] = client.state["marking"].get(options.place)
+        return f"{options.place} holds {answer['tokens']} tokens"
+
+    return hand.give(options, verb, data, told)
+
+
+def _change(text: str) -> int:
+    value = int(text)
+    if not value:
+        raise argparse.ArgumentTypeError("0 tokens change nothing: write +1 or -1")
+    return value

@@ -1,0 +1,114 @@
+"""Follow the run that goes on: firings, starts and ends of actions, commands of operators; until it ends."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+
+from coordinator.cli import CommandError
+from coordinator.cli.operate import hand
+
+if TYPE_CHECKING:
+    from coordinator.hmi.client import OperatorClient
+
+EXAMPLE = "petrobot watch --json - | jq .kind"
+ENDED = {"success": 0, "failure": 1, "error": 1, "aborted": 1, "stopped": 1}
+"""Exit code by the state in which a run ends."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    hand.add_run_arguments(parser)
+    parser.add_argument(
+        "--as", dest="name", metavar="NAME", help="who you are for the others (default: your user name)"
+    )
+    parser.add_argument("--json", metavar="FILE", help="every change as a line of JSON (- for standard output)")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Watch; 0 when the run ends in success, 1 when it ends otherwise."""
+    if options.json in (None, "-"):
+        return asyncio.run(_watch(options, sys.stdout))
+    try:
+        with Path(options.json).open("w", encoding="utf-8") as file:
+            return asyncio.run(_watch(options, file))
+    except OSError as fault:
+        raise CommandError(2, f"{options.json}: {fault.strerror or fault}") from fault
+
+
+async def _watch(options: argparse.Namespace, out: TextIO) -> int:
+    from coordinator.hmi.client import OperatorError
+
+    door = hand.find(options)
+    try:
+        async with hand.connect(door, options.name) as client:
+            return await _follow(client, out, plain=not options.json)
+    except OperatorError as fault:
+        raise CommandError(3, f"{door.run}: {fault}") from fault
+
+
+async def _follow(client: OperatorClient, out: TextIO, plain: bool) -> int:
+    _write(out, _snapshot(client) if plain else json.dumps({"kind": "snapshot", **client.state}, default=str))
+    async for change in client.changes():
+        text = _line(change) if plain else json.dumps(change, default=str)
+        if text:
+            _write(out, text)
+        state = client.state["mission"]["state"]
+        if state in ENDED and change["kind"] in ("mission", "reset"):
+            return ENDED[state]
+    return ENDED.get(client.state["mission"]["state"], 3)
+
+
+def _write(out: TextIO, text: str) -> None:
+    out.write(text + "\n")
+    out.flush()
+
+
+def _snapshot(client: OperatorClient) -> str:
+    mission, controls = client.state["mission"], client.state["controls"]
+    tokens = ", ".join(f"{place} {n}" for place, n in client.state["marking"].items() if n)
+    return f"{mission['id']}: {mission['state']}; controls: {controls['holder'] or 'nobody'}; tokens: {tokens}"
+
+
+def _line(change: Mapping[str, Any]) -> str:
+    """A change in words; empty for what people need not read."""
+    words = _WORDS.get(change["kind"])
+    said = words(change) if words is not None else ""
+    return f"{change.get('time', 0.0):10.3f} s  {said}" if said else ""
+
+
+def _ended(change: Mapping[str, Any]) -> str:
+    reason = change.get("reason") or {}
+    why = f"  {reason.get('code')}: {reason.get('text')}" if reason.get("code") else ""
+    return f"ended    {change['id']}  {str(change['status']).upper()}{why}"
+
+
+def _paused(change: Mapping[str, Any]) -> str:
+    paused = change["paused"]
+    if paused is None:
+        return "goes on"
+    nodes = ", ".join(f"{node} {answer}" for node, answer in paused["nodes"].items())
+    return f"paused   {paused['reason']}" + (f" ({nodes})" if nodes else "")
+
+
+_WORDS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
+    "fired": lambda c: f"fired    {c['firing']['transition']}  ({c['firing']['cause']})",
+    "run_started": lambda c: f"started  {c['run']['id']}  {c['run']['action']} on {c['run']['node'] or 'no node'}",
+    "run_ended": _ended,
+    "paused": _paused,
+    "mission": lambda c: (
+        f"mission  {c['mission']['state']}" + (f": {c['mission']['reason']}" if c["mission"].get("reason") else "")
+        if "state" in c["mission"]
+        else ""
+    ),
+    "notice": lambda c: f"{c['notice']['level']:8} {c['notice']['text']}",
+    "controls": lambda c: f"controls {c['controls']['holder'] or 'free'}",
+    "breakpoints": lambda c: f"breaks   {', '.join(c['breakpoints']) or 'none'}",
+    "selector": lambda c: f"selector {c['name']}: {c['selector'].get('override') or 'free choice'}",
+    "node": lambda c: f"node     {c['name']} {c['node']['state']} {c['node'].get('text', '')}".rstrip(),
+}

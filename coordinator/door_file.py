@@ -1,0 +1,77 @@
+"""Where a mission run that goes on can be steered: address and token, in its run folder, for its owner's eyes alone."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from coordinator.runfolder import DEFAULT, NoRunError, journal_of
+
+DOOR = "operator.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Door:
+    """How to reach the coordinator of a mission run."""
+
+    run: str
+    url: str
+    """Without the token: http://127.0.0.1:PORT."""
+    token: str
+    process: int
+    """Process id of the coordinator."""
+    services: str = ""
+    """Path of the cell's services.toml."""
+
+
+@contextmanager
+def door_open(folder: Path, door: Door) -> Iterator[Path]:
+    """Leave the door's address in a run folder for as long as it is open; its owner alone may read it (mode 600)."""
+    path = folder / DOOR
+    path.unlink(missing_ok=True)  # of a coordinator that was killed
+    folder.mkdir(parents=True, exist_ok=True)
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
+        json.dump(asdict(door), file)
+    try:
+        yield path
+    finally:
+        path.unlink(missing_ok=True)
+
+
+def find_door(name: str | None = None, folder: Path = DEFAULT) -> Door:
+    """The door of the named mission run (None: of the newest that goes on). Raises NoRunError."""
+    if name is not None:
+        run = journal_of(name, folder).parent
+        door = _read(run / DOOR)
+        if door is None:
+            raise NoRunError(f"{run.name} does not go on: only a run that goes on can be steered")
+        return door
+    doors = [door for path in _newest_first(folder) if (door := _read(path)) is not None]
+    if not doors:
+        raise NoRunError(
+            f"no run in {folder} goes on; begin one with `petrobot run`, or name its folder with --journal"
+        )
+    return doors[0]
+
+
+def _newest_first(folder: Path) -> list[Path]:
+    found: list[tuple[float, Path]] = []
+    for path in folder.glob(f"*/{DOOR}"):
+        with contextlib.suppress(OSError):
+            found.append((path.stat().st_mtime, path))
+    return [path for _, path in sorted(found, reverse=True)]
+
+
+def _read(path: Path) -> Door | None:
+    """The door in a file; None when there is none, or when its coordinator is no more."""
+    try:
+        door = Door(**json.loads(path.read_text(encoding="utf-8")))
+        os.kill(door.process, 0)
+    except (OSError, ValueError, TypeError):
+        return None
+    return door

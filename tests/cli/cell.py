@@ -1,0 +1,203 @@
+"""A cell in one process: a node with an arm that takes its time, over real sockets, and a task with a bit of everything."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from services.action import Context, Result, success
+from services.comm.directory import Directory, parse
+from services.comm.server import Server
+from services.device import Ports
+from services.node import Node
+from services.place import InlinePlace
+
+SERVICES = """\
+schema = 1
+[nodes.robot]
+host = "127.0.0.1"
+port = {port}
+[devices.arm]
+node = "robot"
+driver = "tests.cli.cell:Arm"
+[actions.reach]
+run = "tests.cli.cell:reach"
+task = "work"
+device = "arm"
+[actions.reach_slowly]
+run = "tests.cli.cell:reach"
+task = "work"
+device = "arm"
+[actions.recover]
+run = "tests.cli.cell:recover"
+task = "recover"
+device = "arm"
+"""
+
+TASK = """\
+schema = 1
+[task]
+name = "reaching"
+goal = "the arm has reached as often as asked"
+final = "jobs == 0 and arm_free == 1"
+final_error = "out_of_order == 1"
+runs_place = "jobs"
+[primitive_tasks.work]
+goal = "the arm has reached"
+alternatives = ["reach", "reach_slowly"]
+deadline = 60.0
+[primitive_tasks.recover]
+goal = "the arm is ready again"
+alternatives = ["recover"]
+deadline = 60.0
+[events.part_there]
+scope = "external"
+memory = "latched"
+[places.jobs]
+kind = "control"
+tokens = 2
+capacity = 5
+[places.arm_free]
+kind = "resource"
+tokens = 1
+capacity = 1
+[places.work]
+kind = "action"
+task = "work"
+[places.recover]
+kind = "action"
+task = "recover"
+[places.out_of_order]
+kind = "control"
+capacity = 1
+[transitions.start]
+in = ["jobs", "arm_free"]
+out = ["work"]
+event = "part_there"
+[transitions.nothing_comes]
+in = ["jobs", "arm_free"]
+out = ["arm_free"]
+after = 600.0
+[transitions.done]
+in = ["work:normal"]
+out = ["arm_free"]
+[transitions.failed]
+in = ["work:error"]
+out = ["recover"]
+[transitions.recovered]
+in = ["recover:normal"]
+out = ["arm_free"]
+[transitions.given_up]
+in = ["recover:error"]
+out = ["out_of_order"]
+"""
+
+
+class Arm:
+    """A driver that reaches when an action has told it to and the test lets it."""
+
+    newest: Arm
+
+    def __init__(self, config: Mapping[str, Any], ports: Ports | None) -> None:
+        self.period: float | None = 0.004
+        self.holdable = True
+        self.moving = self.held = False
+        self.reaches = 0
+        self.quick_stops: list[float] = []
+
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        """Begin to reach."""
+        self.moving = True
+
+    def arrive(self) -> None:
+        """The test lets it arrive."""
+        self.moving = False
+        self.reaches += 1
+
+    def step(self, now: float) -> None:
+        """Nothing moves by itself."""
+
+    def state(self) -> Mapping[str, Any]:
+        """How often it has reached."""
+        return {"reaches": self.reaches, "moving": self.moving, "held": self.held}
+
+    def stop(self, now: float) -> None:
+        """Stand."""
+        self.moving = False
+
+    def quick_stop(self, now: float) -> None:
+        """Stand at once."""
+        self.moving = False
+        self.quick_stops.append(now)
+
+    def stopped(self) -> bool:
+        """Whether it stands."""
+        return not self.moving
+
+    def hold(self, now: float) -> str:
+        """Hold, if the test lets it."""
+        self.held = self.holdable
+        return "held" if self.holdable else "cannot hold"
+
+    def release(self, now: float) -> None:
+        """Go on."""
+        self.held = False
+
+    def close(self) -> None:
+        """Nothing to let go."""
+
+
+async def reach(ctx: Context) -> Result:
+    """Reach once."""
+    number = ctx.device.send({"reach": True})
+    before = ctx.device.state["reaches"]
+    await ctx.wait(lambda: ctx.device.handled >= number and ctx.device.state["reaches"] > before)
+    return success()
+
+
+async def recover(ctx: Context) -> Result:
+    """Be ready at once."""
+    return success()
+
+
+class RobotNode:
+    """The node, in this loop."""
+
+    def __init__(self, directory: Directory) -> None:
+        self.directory = directory
+        self.arm = Arm({}, None)
+        loop = asyncio.get_running_loop()
+        place = InlinePlace(directory.actions, clock=loop.time, driver=self.arm)
+        self.node = Node(directory, "robot", boot="b1", clock=loop.time, places={"arm": place})
+        self.server = Server(self.node.callee, on_orders=self.node.obey)
+        self._pump: asyncio.Task[None] | None = None
+
+    async def start(self) -> None:
+        """Listen, and do what is due every 4 ms."""
+        await self.server.start(*self.directory.address("robot"))
+        self._pump = asyncio.create_task(self._advance())
+
+    async def _advance(self) -> None:
+        while True:
+            self.node.advance(self.server.now())
+            self.server.flush()
+            await asyncio.sleep(0.004)
+
+    async def close(self) -> None:
+        """Leave."""
+        if self._pump is not None:
+            self._pump.cancel()
+        await self.server.close()
+
+
+def directory_in(folder: Path) -> Directory:
+    """The cell's location file on a free port."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    path = folder / "services.toml"
+    path.write_text(SERVICES.format(port=port), encoding="utf-8")
+    return parse(path.read_text(encoding="utf-8"), path)

@@ -1,0 +1,120 @@
+"""A mission run that goes on over a node in this process, and the command line in front of it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+import pytest_asyncio
+
+from coordinator.cli import main
+from coordinator.door_file import Door, door_open
+from coordinator.hmi.server import Page, start_page
+from coordinator.launch import Setting, realtime_mission
+from coordinator.mission import Mission
+from coordinator.operation import Operation
+from coordinator.partners import FirstAlternative
+from coordinator.realtime import RealtimeMission
+from coordinator.runfolder import JOURNAL
+from coordinator.taskfile import loads
+from tests.cli.cell import TASK, Arm, RobotNode, directory_in
+
+RUN = "reaching-1"
+
+
+class Said(NamedTuple):
+    """What a command gave."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def json(self) -> Any:
+        """Its answer, of `--json -`."""
+        return json.loads(self.out)
+
+
+class Terminal:
+    """The commands of operators, in threads of their own; this loop serves them meanwhile."""
+
+    def __init__(self, shell: RealtimeMission, page: Page, robot: RobotNode, folder: Path, read: Callable[[], Any]):
+        self.shell = shell
+        self.page = page
+        self.robot = robot
+        self.folder = folder
+        self.runs = folder / "runs"
+        self._read = read
+
+    @property
+    def mission(self) -> Mission:
+        """The mission run."""
+        return self.shell.mission
+
+    @property
+    def arm(self) -> Arm:
+        """The robot's arm."""
+        return self.robot.arm
+
+    def tokens(self, place: str) -> int:
+        """Tokens in a place now."""
+        net = self.mission.executor.task.net
+        return self.mission.executor.state.marking[net.place_index[place]]
+
+    async def __call__(self, *arguments: str) -> Said:
+        """Run `petrobot ARGUMENTS --journal RUNS`."""
+        self._read()
+        code = await asyncio.to_thread(main, [*arguments, "--journal", str(self.runs)])
+        said = self._read()
+        return Said(code, said.out, said.err)
+
+    async def until(self, holds: Callable[[], bool], timeout: float = 20.0) -> None:
+        """Wait until something holds."""
+        async with asyncio.timeout(timeout):
+            while not holds():
+                await asyncio.sleep(0.002)
+
+    async def working(self, *options: str) -> None:
+        """Lead the run to where the arm reaches."""
+        said = await self("raise", "part_there", *options)
+        assert said.code == 0, said.err
+        await self.until(lambda: self.arm.moving)
+
+
+@asynccontextmanager
+async def cell_of(folder: Path, read: Callable[[], Any]) -> AsyncIterator[Terminal]:
+    """A mission run that has begun and waits for its first part."""
+    directory = directory_in(folder)
+    robot = RobotNode(directory)
+    await robot.start()
+    selector = FirstAlternative()
+    mission = realtime_mission(directory, Setting(loads(TASK, "reaching.toml"), selector=selector), RUN)
+    shell = RealtimeMission(mission, directory)
+    await shell.connect()
+    operation = Operation(shell, selector)
+    page = await start_page(operation, tasks_folder=folder, page=False)
+    (folder / "runs" / RUN).mkdir(parents=True)
+    (folder / "runs" / RUN / JOURNAL).touch()
+    running = asyncio.create_task(shell.run())
+    door = Door(RUN, page.base, page.token, os.getpid(), str(directory.source))
+    with door_open(folder / "runs" / RUN, door):
+        yield Terminal(shell, page, robot, folder, read)
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
+    await page.close()
+    await operation.close()
+    await shell.close()
+    await robot.close()
+
+
+@pytest_asyncio.fixture
+async def petrobot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> AsyncIterator[Terminal]:
+    """A mission run that can be steered."""
+    async with cell_of(tmp_path, capsys.readouterr) as terminal:
+        yield terminal

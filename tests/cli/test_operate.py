@@ -1,0 +1,274 @@
+"""The operator's commands against a mission run that goes on: what they change, what they answer, and whom they refuse."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import stat
+from pathlib import Path
+
+import pytest
+
+from coordinator.cli import COMMANDS, main
+from coordinator.door_file import DOOR, Door, door_open, find_door
+from coordinator.engine import Mode
+from coordinator.hmi import house
+from coordinator.runfolder import JOURNAL, NoRunError
+from tests.cli.conftest import RUN, Terminal
+
+STEERING = [command.name for command in COMMANDS if command.module.startswith("operate.")]
+
+
+async def test_pause_reaches_the_devices_and_continue_releases_them(petrobot: Terminal) -> None:
+    """The arm really holds; the answer names its node."""
+    await petrobot.working()
+    said = await petrobot("pause", "--json", "-")
+    assert (said.code, said.json["nodes"]) == (0, {"robot": "held"})
+    assert petrobot.arm.held and petrobot.mission.executor.state.mode is Mode.PAUSED
+    said = await petrobot("continue")
+    assert said.code == 0 and "goes on" in said.out
+    await petrobot.until(lambda: not petrobot.arm.held)
+
+
+async def test_a_device_that_cannot_hold_says_so(petrobot: Terminal) -> None:
+    """In words that cannot be overlooked."""
+    petrobot.arm.holdable = False
+    await petrobot.working()
+    said = await petrobot("pause")
+    assert said.code == 0 and "robot" in said.out and "CANNOT HOLD" in said.out
+
+
+async def test_a_node_that_is_frozen_counts_as_lost(petrobot: Terminal) -> None:
+    """A pause is answered, though the node is not heard of."""
+    await petrobot.working()
+    assert petrobot.robot._pump is not None
+    petrobot.robot._pump.cancel()
+    said = await petrobot("pause", "--json", "-")
+    assert said.json["nodes"] == {"robot": "lost"}
+
+
+async def test_paused_with_nothing_under_way_the_node_is_idle(petrobot: Terminal) -> None:
+    """Nothing had to hold."""
+    said = await petrobot("pause", "--json", "-")
+    assert said.json["nodes"] == {"robot": "idle"}
+
+
+async def test_what_was_held_is_released_by_an_abort(petrobot: Terminal) -> None:
+    """The next mission run must not find an arm that still holds."""
+    await petrobot.working()
+    await petrobot("pause")
+    assert petrobot.arm.held
+    assert (await petrobot("abort")).code == 0
+    await petrobot.until(lambda: petrobot.mission.executor.finished is not None)
+    await petrobot.until(lambda: not petrobot.arm.held)
+
+
+async def test_step_fires_once(petrobot: Terminal) -> None:
+    """And pauses again."""
+    await petrobot("pause")
+    await petrobot("raise", "part_there")
+    assert petrobot.tokens("jobs") == 2
+    said = await petrobot("step", "--json", "-")
+    assert said.json["firing"]["transition"] == "start"
+    assert petrobot.tokens("work") == 1
+    await petrobot.until(lambda: petrobot.mission.executor.state.mode is Mode.PAUSED)
+
+
+async def test_breakpoints(petrobot: Terminal) -> None:
+    """Set, told, hit, cleared."""
+    assert "start" in (await petrobot("break", "start")).out
+    await petrobot("raise", "part_there")
+    await petrobot.until(lambda: petrobot.mission.executor.state.mode is Mode.PAUSED)
+    assert (await petrobot("break", "--json", "-")).json["breakpoints"] == ["transitions.start"]
+    assert (await petrobot("break", "start", "--off", "--json", "-")).json["breakpoints"] == []
+    await petrobot("continue")
+    await petrobot.until(lambda: petrobot.arm.moving)
+
+
+async def test_tokens_go_into_and_out_of_control_places_only(petrobot: Terminal) -> None:
+    """Within their capacity; what is refused changes nothing and is exit code 1."""
+    assert (await petrobot("token", "jobs", "+2", "--json", "-")).json["tokens"] == 4
+    assert (await petrobot("token", "jobs", "-1", "--json", "-")).json["tokens"] == 3
+    full = await petrobot("token", "jobs", "+3")
+    assert full.code == 1 and "at most 5" in full.err
+    other = await petrobot("token", "arm_free", "+1")
+    assert other.code == 1 and "no control place" in other.err
+    assert petrobot.tokens("jobs") == 3
+
+
+async def test_a_forced_exit_leaves_an_action_that_hangs(petrobot: Terminal) -> None:
+    """The run is cancelled and counts none."""
+    await petrobot.working()
+    said = await petrobot("force", "work", "done")
+    assert said.code == 0, said.err
+    await petrobot.until(lambda: petrobot.tokens("arm_free") == 1 and not petrobot.arm.moving)
+    await petrobot.until(lambda: bool(petrobot.mission.tally.runs))
+    assert [record.status for record in petrobot.mission.tally.runs] == [None]
+
+
+async def test_the_operator_chooses_the_alternative(petrobot: Terminal) -> None:
+    """Until the choice is given back."""
+    assert (await petrobot("override", "work", "reach_slowly")).code == 0
+    await petrobot.working()
+    assert list(petrobot.mission.tally.chosen.values()) == ["reach_slowly"]
+    assert (await petrobot("override", "work", "--free")).code == 0
+    petrobot.arm.arrive()
+    await petrobot.until(lambda: petrobot.tokens("arm_free") == 1)
+    await petrobot.working()
+    assert list(petrobot.mission.tally.chosen.values()) == ["reach_slowly", "reach"]
+
+
+async def test_abort_ends_the_run_in_error(petrobot: Terminal) -> None:
+    """With who did it."""
+    await petrobot.working("--as", "ana")
+    assert (await petrobot("abort", "--as", "ana")).code == 0
+    await petrobot.until(lambda: petrobot.mission.executor.finished is not None)
+    finished = petrobot.mission.executor.finished
+    assert finished is not None and "ana" in finished.reason
+    assert not petrobot.arm.moving
+
+
+async def test_emergency_stop_stops_latches_and_ends_the_run(petrobot: Terminal) -> None:
+    """The arm stops at once and obeys nobody until it is cleared, not even the task's own recovery."""
+    await petrobot.working()
+    said = await petrobot("estop", "--json", "-")
+    assert said.code == 0, said.err
+    (node,) = said.json["nodes"]
+    assert (node["node"], node["devices"], node["bus"]) == ("robot", {"arm": "stopped"}, "")
+    assert said.json["coordinator"] == f"{RUN}: aborted"
+    assert petrobot.arm.quick_stops and not petrobot.arm.moving
+    await petrobot.until(lambda: petrobot.mission.executor.finished is not None)
+    reached = petrobot.shell.clients["robot"]
+    refused = await reached.call("reach")
+    assert (refused.cause, refused.executed) == ("emergency_stop", "no")
+    assert (await petrobot("estop", "--clear")).code == 0
+    call = asyncio.ensure_future(reached.call("reach"))
+    await petrobot.until(lambda: petrobot.arm.moving)
+    petrobot.arm.arrive()
+    assert (await call).status == "success"
+
+
+async def test_an_emergency_stop_needs_no_controls(petrobot: Terminal) -> None:
+    """Whoever holds them."""
+    assert (await petrobot("pause", "--as", "ana")).code == 0
+    assert (await petrobot("estop", "--json", "-")).code == 0
+
+
+async def test_one_operator_holds_the_controls(petrobot: Terminal) -> None:
+    """A second one is told who; after a handover he may."""
+    assert (await petrobot("pause", "--as", "ana")).code == 0
+    refused = await petrobot("continue", "--as", "bob")
+    assert refused.code == 1 and "ana" in refused.err and "holds the controls" in refused.err
+    assert petrobot.mission.executor.state.mode is Mode.PAUSED
+    late = await petrobot("continue", "--as", "bob", "--take", "0.2")
+    assert late.code == 1 and "did not hand over" in late.err
+    assert (await petrobot("continue", "--as", "ana")).code == 0
+
+
+async def test_controls_are_asked_for_and_handed_over(petrobot: Terminal) -> None:
+    """`--take` waits until the holder releases them to whoever asks."""
+    from coordinator.cli.operate.hand import connect
+
+    async with connect(find_door(folder=petrobot.runs), "ana") as ana:
+        assert (await ana.command("take_controls"))["ok"]
+        asking = asyncio.create_task(petrobot("pause", "--as", "bob", "--take", "20"))
+        assert await ana.until(lambda state: bool(state["controls"]["asking"]), 20)
+        (bob,) = ana.state["controls"]["asking"]
+        assert (await ana.command("release_controls", {"to": bob}))["ok"]
+        assert (await asking).code == 0
+        refused = await ana.command("resume")
+        assert refused["code"] == "not_holder"
+
+
+async def test_controls_of_a_script_go_free(petrobot: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that took them over plain HTTP and is not heard of again."""
+    import aiohttp
+
+    monkeypatch.setattr(house, "ABSENT_S", 0.1)
+    monkeypatch.setattr(house, "CLOCK_S", 0.01)
+    headers = {"Authorization": f"Bearer {petrobot.page.token}"}
+    async with aiohttp.ClientSession(headers=headers) as http:
+        body = {"verb": "take_controls", "name": "script"}
+        async with http.post(f"{petrobot.page.base}/api/command", json=body) as answer:
+            assert (await answer.json())["ok"]
+    async with asyncio.timeout(20):
+        while (await petrobot("pause", "--as", "ana")).code != 0:
+            await asyncio.sleep(0.01)
+
+
+async def test_watch_tells_what_happens_until_the_end(petrobot: Terminal) -> None:
+    """As lines for people, and as JSON lines; its exit code is the run's."""
+    path = petrobot.folder / "changes.jsonl"
+    watching = asyncio.create_task(petrobot("watch", "--json", str(path)))
+    await petrobot.until(lambda: path.exists() and path.stat().st_size > 0)
+    await petrobot.working()
+    petrobot.arm.arrive()
+    await petrobot.until(lambda: petrobot.tokens("arm_free") == 1)
+    await petrobot("abort")
+    assert (await watching).code == 1
+    changes = [json.loads(line) for line in path.read_text().splitlines()]
+    assert changes[0]["kind"] == "snapshot"
+    fired = [change["firing"]["transition"] for change in changes if change["kind"] == "fired"]
+    assert fired == ["start", "done"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("raise", "part_their"), "did you mean 'part_there'"),
+        (("force", "work", "start"), "no way out of work is named 'start'"),
+        (("force", "jobs", "done"), "no action place is named 'jobs'"),
+        (("break", "nowhere"), "no place or transition is named 'nowhere'"),
+        (("token", "jobs", "0"), "0 tokens"),
+        (("token", "job", "+1"), "did you mean 'jobs'"),
+        (("override", "work"), "or say --free"),
+        (("override", "work", "fly"), "no alternative is named 'fly'"),
+        (("pause", "--run", "nowhere"), "no run 'nowhere'"),
+    ],
+)
+async def test_bad_input_is_exit_code_2_and_names_the_remedy(
+    petrobot: Terminal, arguments: tuple[str, ...], says: str
+) -> None:
+    """Nothing is sent, nothing changes."""
+    said = await petrobot(*arguments)
+    assert said.code == 2 and says in said.err
+    assert petrobot.mission.executor.state.mode is Mode.RUNNING
+
+
+@pytest.mark.parametrize("name", STEERING)
+def test_without_a_run_every_command_says_so(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One clear line and exit code 2."""
+    arguments = {"break": ["x"], "token": ["p", "+1"], "raise": ["e"], "force": ["p", "t"], "override": ["t", "a"]}
+    assert main([name, *arguments.get(name, []), "--journal", str(tmp_path)]) == 2
+    assert "goes on; begin one with `petrobot run`" in capsys.readouterr().err
+
+
+async def test_a_coordinator_that_is_gone_is_exit_code_3(petrobot: Terminal) -> None:
+    """The process lives, but nobody listens there any more."""
+    await petrobot.page.close()
+    said = await petrobot("pause")
+    assert said.code == 3 and "cannot be reached" in said.err
+
+
+def test_the_door_is_its_owners_alone_and_gone_with_its_run(tmp_path: Path) -> None:
+    """The token in it opens everything."""
+    import os
+
+    (tmp_path / "r").mkdir()
+    (tmp_path / "r" / JOURNAL).touch()
+    door = Door("r", "http://127.0.0.1:1", "secret", os.getpid())
+    with door_open(tmp_path / "r", door) as path:
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+        assert find_door(folder=tmp_path) == find_door("r", tmp_path) == door
+    assert not path.exists()
+    with pytest.raises(NoRunError, match="does not go on"):
+        find_door("r", tmp_path)
+
+
+def test_the_door_of_a_killed_coordinator_is_no_door(tmp_path: Path) -> None:
+    """Its process is no more; the next one at this run replaces it."""
+    (tmp_path / "r").mkdir()
+    dead = {"run": "r", "url": "http://127.0.0.1:1", "token": "t", "process": 2**22 + 1}
+    (tmp_path / "r" / DOOR).write_text(json.dumps(dead))
+    with pytest.raises(NoRunError):
+        find_door(folder=tmp_path)
