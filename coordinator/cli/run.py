@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import os
 import sys
 import time
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
@@ -66,7 +67,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_page_arguments(parser: argparse.ArgumentParser) -> None:
     """Whether and where the operator's page is served while a real-time run goes on."""
-    parser.add_argument("--no-page", action="store_true", help="serve no operator's page")
+    parser.add_argument(
+        "--no-page", action="store_true", help="serve no operator's page; the command line still steers the run"
+    )
     parser.add_argument(
         "--page-port", type=int, default=0, metavar="PORT", help="the page's port (default: a free one)"
     )
@@ -288,11 +291,9 @@ async def drive(
 
 @asynccontextmanager
 async def _page(shell: RealtimeMission, options: argparse.Namespace) -> AsyncIterator[None]:
-    """The operator's page, while the mission run goes on."""
-    if options.no_page:
-        yield
-        return
+    """The operator's page, or with --no-page his protocol alone, while the mission run goes on."""
     from coordinator.cli.loading import SHIPPED
+    from coordinator.door_file import Door, door_open
     from coordinator.hmi.journals import JournalHistory
     from coordinator.hmi.server import start_page
     from coordinator.operation import Operation
@@ -302,10 +303,16 @@ async def _page(shell: RealtimeMission, options: argparse.Namespace) -> AsyncIte
     assert isinstance(selector, FirstAlternative)
     operation = Operation(shell, selector)
     history = JournalHistory(getattr(options, "journal", Path("runs")))
-    page = await start_page(operation, tasks_folder=SHIPPED, port=options.page_port, history=history)
-    print(f"page: {page.url}", file=sys.stderr, flush=True)
+    page = await start_page(
+        operation, tasks_folder=SHIPPED, port=options.page_port, history=history, page=not options.no_page
+    )
+    if not options.no_page:
+        print(f"page: {page.url}", file=sys.stderr, flush=True)
+    executor = shell.mission.executor
+    door = Door(executor.mission, page.base, page.token, os.getpid(), str(executor.directory.source.resolve()))
     try:
-        yield
+        with door_open(options.folder, door):
+            yield
     finally:
         await page.close()
         await operation.close()
