@@ -1,0 +1,116 @@
+"""The driver of the camera that looks at the floor ahead: starts and stops images, hands them to actions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import cv2
+
+from services.action import Context
+from services.comm.image import Image
+from services.device import Ports
+from services.mobile.model import NOMINAL, nominal_rover, read_rover
+from services.mobile.watching import FloorWatch
+
+
+class CameraError(ValueError):
+    """The camera's config or its images cannot be used; the text says what to change."""
+
+
+class FloorCamera:
+    """A device without cyclic duty. Its keys in services.toml, all optional but those of its source:
+
+    `rover`: file of numbers beside services.toml (default: the shipped one); `rate`: images/s (default: the file's);
+    `threads`: for OpenCV (default 1: cores are shared with other nodes).
+    """
+
+    period: float | None = None
+
+    def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
+        name = str(config.get("rover", ""))
+        rover = read_rover(ports.file(name).decode(), name) if name else nominal_rover()
+        cv2.setNumThreads(int(config.get("threads", 1)))
+        self._images = ports.images()
+        self.floor = FloorWatch.of(rover)
+        self.usual_rate = float(config.get("rate", rover.camera.rate))
+        if not 0.0 < self.usual_rate <= 1000.0:
+            raise CameraError(f"camera: rate = {self.usual_rate} images/s; give one between 0 and 1000, such as 25")
+        self._rate = 0.0
+        self._count = 0
+        self._newest: Image | None = None
+
+    # For actions
+
+    @property
+    def rate(self) -> float:
+        """Images/s asked for now, 0 when none."""
+        return self._rate
+
+    def start(self) -> None:
+        """Have images taken. Raises ConnectionError when the source cannot be opened."""
+        if not self._rate:
+            self._newest = None
+            self._images.start(self.usual_rate)
+            self._rate = self.usual_rate
+
+    def end(self) -> None:
+        """Take no more images."""
+        if self._rate:
+            self._images.stop()
+        self._rate, self._newest = 0.0, None
+
+    async def read(self, ctx: Context, timeout: float) -> Image | None:
+        """The newest image not read yet, None when none comes for `timeout` s. Raises CameraError for one of another size."""
+        await ctx.wait(self._arrived, timeout)
+        image, self._newest = self._newest, None
+        if image is None:
+            return None
+        view = self.floor.view
+        if image.pixels.shape != (view.height, view.width):
+            high, wide = image.pixels.shape
+            raise CameraError(
+                f"the camera gives {wide}x{high} images, its numbers say {view.width}x{view.height}: "
+                f"change [camera] of {NOMINAL} or the camera's settings"
+            )
+        self._count += 1
+        return image
+
+    def _arrived(self) -> bool:
+        newest = self._images.newest()
+        if newest is not None:
+            self._newest = newest
+        return self._newest is not None
+
+    # For the node
+
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        """Cyclic drivers take commands; this one's actions use its methods."""
+        raise ValueError("the camera takes no commands; its actions read images")
+
+    def step(self, now: float) -> None:
+        """Nothing is due between images."""
+
+    def state(self) -> Mapping[str, Any]:
+        """Plain data for operator and report."""
+        return {"rate": self._rate, "images": self._count}
+
+    def stop(self, now: float) -> None:
+        """Take no more images."""
+        self.end()
+
+    def stopped(self) -> bool:
+        """Whether no images are taken; a camera never moves."""
+        return self._rate == 0.0
+
+    def hold(self, now: float) -> str:
+        """The floor waits: images may go on being taken, the rover holds by itself."""
+        return "held"
+
+    def release(self, now: float) -> None:
+        """Nothing was held."""
+
+    def close(self) -> None:
+        """Let the source go."""
+        self.end()
+        self._images.close()

@@ -1,0 +1,317 @@
+"""Finding the track in an image, four ways of different cost and reliability.
+
+All look at scan rows of the floor (see `ScanGrid`) and give the centre line as points of the body frame. `expected` is the
+line of the image before, if there was one: then only what goes on with it counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.mobile.candidates import Candidates, contrast_threshold, edge_pairs, ridge_strength, ridges
+from services.mobile.floor import Grey, ScanGrid
+from services.mobile.sight import UNSEEN, Line, Sight, Vector, polynomial
+
+GATE = 0.07
+"""m that the line may be off the one expected."""
+STEP_GATE = 0.016
+"""m that a point may be off the line drawn through those before it, and STEP_SLOPE m more for each metre onwards."""
+STEP_SLOPE = 0.55
+GAP = 0.13
+"""m without a sight after which a line counts as broken off: square edges and glare hide less."""
+STEEPEST = 1.6
+"""Slope against straight ahead beyond which rows cut the line too slantingly."""
+FIRST_SLOPE = 0.9
+"""Steepest slope that a line that was not expected may begin with."""
+SHORTEST = 0.16
+"""m of line that count as one."""
+
+
+class Detector(Protocol):
+    """Gives the line in samples of an image (rows, columns) of a grid."""
+
+    def __call__(self, grid: ScanGrid, samples: Grey, width: float, expected: Line | None) -> Sight:
+        """Find the line; `UNSEEN` if there is none."""
+
+
+def detect_edges(grid: ScanGrid, samples: Grey, width: float, expected: Line | None) -> Sight:
+    """Pairs of opposite edges, chained from near to far: the cheapest and most accurate on clean paint."""
+    return chain(grid, edge_pairs(grid, samples, width), expected)
+
+
+def detect_ridge(grid: ScanGrid, samples: Grey, width: float, expected: Line | None) -> Sight:
+    """Ridges of the absolute second difference, chained from near to far: averages noise over the track's width."""
+    return chain(grid, ridges(grid, samples, width), expected)
+
+
+class _Chain:
+    """A line that grows from near to far, point by point."""
+
+    __slots__ = ("slope", "strength", "x", "y")
+
+    def __init__(self, x: float, y: float, slope: float, strength: float) -> None:
+        self.x, self.y, self.slope, self.strength = [x], [y], slope, strength
+
+    def ahead(self, x: float) -> float:
+        """Where it should be at a distance x (m)."""
+        return self.y[-1] + self.slope * (x - self.x[-1])
+
+    def add(self, x: float, y: float) -> None:
+        """Take a point; the slope follows the points of the last tenth of a metre and turns on with them."""
+        self.x.append(x)
+        self.y.append(y)
+        back = len(self.x) - 1
+        while back > 0 and x - self.x[back] < 0.10:
+            back -= 1
+        fresh = (y - self.y[back]) / (x - self.x[back])
+        self.slope = fresh if back or len(self.x) > 4 else 0.5 * (self.slope + fresh)
+
+    @property
+    def length(self) -> float:
+        """How far it reaches (m along x)."""
+        return self.x[-1] - self.x[0]
+
+
+def chain(grid: ScanGrid, candidates: Candidates, expected: Line | None) -> Sight:
+    """The best line through candidates: each row's nearest to where the line should be, from the nearest rows on."""
+    rows = _by_row(grid, candidates)
+    begun = _seeds(grid, rows, expected)
+    best: _Chain | None = None
+    for seed, first in begun:
+        _grow(seed, first, grid, rows)
+        if seed.length >= SHORTEST and (best is None or _worth(seed) > _worth(best)):
+            best = seed
+    return _sight(grid, best) if best is not None else UNSEEN
+
+
+def _by_row(grid: ScanGrid, candidates: Candidates) -> list[list[float]]:
+    rows: list[list[float]] = [[] for _ in range(grid.x.size)]
+    for row, y in zip(candidates.row.tolist(), candidates.y.tolist(), strict=True):
+        rows[row].append(y)
+    return rows
+
+
+def _seeds(grid: ScanGrid, rows: list[list[float]], expected: Line | None) -> list[tuple[_Chain, int]]:
+    """Beginnings of lines with the row after which each goes on."""
+    seeds: list[tuple[_Chain, int]] = []
+    x = grid.x.tolist()
+    if expected is not None:
+        for i, places in enumerate(rows):
+            if x[i] > expected.near + 0.45 or len(seeds) == 3:
+                break
+            wanted = expected.at(x[i])
+            near = [y for y in places if abs(y - wanted) < GATE]
+            if near:
+                y = min(near, key=lambda y: abs(y - wanted))
+                slope = expected.slope + expected.bend * (x[i] - expected.near)
+                seeds.append((_Chain(x[i], y, slope, 0.0), i + 1))
+        return seeds
+    for i, places in enumerate(rows):
+        if len(seeds) >= 14:
+            break
+        for y in places:
+            if not any(abs(y - s.ahead(x[i])) < 0.06 for s, _ in seeds):
+                seeds += _pairs_on(x, rows, i, y)
+    return seeds
+
+
+def _pairs_on(x: list[float], rows: list[list[float]], i: int, y: float) -> list[tuple[_Chain, int]]:
+    """Lines from a place to each place of the next rows that is not too far aside."""
+    for j in range(i + 1, min(i + 4, len(x))):
+        slopes = [(other - y) / (x[j] - x[i]) for other in rows[j]]
+        fit = sorted((s for s in slopes if abs(s) < FIRST_SLOPE), key=abs)[:2]
+        if fit:
+            return [(_Chain(x[i], y, slope, 0.0), i + 1) for slope in fit]
+    return []
+
+
+def _grow(line: _Chain, first: int, grid: ScanGrid, rows: list[list[float]]) -> None:
+    x = grid.x.tolist()
+    for i in range(first, len(x)):
+        onwards = x[i] - line.x[-1]
+        if onwards > GAP or abs(line.slope) > STEEPEST:
+            return
+        wanted = line.ahead(x[i])
+        places = rows[i]
+        if places:
+            y = min(places, key=lambda place: abs(place - wanted))  # noqa: B023 - used at once
+            if abs(y - wanted) <= STEP_GATE + STEP_SLOPE * onwards:
+                line.add(x[i], y)
+
+
+def _worth(line: _Chain) -> float:
+    """Long lines first, near ones before far ones, those ahead before those aside."""
+    return len(line.x) - 12.0 * line.x[0] - 8.0 * abs(line.y[0])
+
+
+def _sight(grid: ScanGrid, line: _Chain) -> Sight:
+    x, y = np.asarray(line.x), np.asarray(line.y)
+    span = (grid.x >= x[0]) & (grid.x <= x[-1])
+    confidence = x.size / max(1, int(span.sum()))
+    return Sight(x, y, confidence, broke_off=_broke_off(grid, line))
+
+
+def _broke_off(grid: ScanGrid, line: _Chain) -> bool:
+    """Whether the rows beyond the last point should show the line, and do not."""
+    if abs(line.slope) > STEEPEST * 0.75:
+        return False
+    end = line.x[-1] + GAP
+    if end > grid.x[-1]:
+        return False
+    aside = line.ahead(end)
+    row = int(np.searchsorted(grid.x, end))
+    column = int(np.searchsorted(grid.y, aside + np.sign(aside) * 0.05))
+    return 0 < column < grid.y.size and bool(grid.seen[min(row, grid.x.size - 1), column])
+
+
+# --- whole-line fits -----------------------------------------------------------------------------------------------------
+
+WINDOW = 0.55
+"""m of line to which a parabola is fitted as a whole."""
+INLIER = 0.018
+"""m off the parabola within which a candidate belongs to it."""
+DRAWS = 60
+"""Triples that are tried."""
+
+
+def consensus(random: Callable[[], np.random.Generator]) -> Detector:
+    """A detector that fits a parabola to edge pairs by random sample consensus (Fischler and Bolles 1981).
+
+    It finds the line among many false pairs, where a chain may take a wrong one; `random` gives the generator to draw from.
+    """
+
+    def detect(grid: ScanGrid, samples: Grey, width: float, expected: Line | None) -> Sight:
+        found = edge_pairs(grid, samples, width)
+        keep = _plausible(grid, found, expected)
+        x, y = grid.x[found.row[keep]], found.y[keep]
+        if np.unique(x).size < 5:
+            return UNSEEN
+        picks = random().integers(0, x.size, (DRAWS, 3))
+        curves = _through(x, y, picks)
+        if curves.size == 0:
+            return UNSEEN
+        off = np.abs(curves[:, :1] + curves[:, 1:2] * x + curves[:, 2:] * x * x - y)
+        best = curves[int((off < INLIER).sum(axis=1).argmax())]
+        return chain_about(grid, found, best)
+
+    return detect
+
+
+def _plausible(grid: ScanGrid, found: Candidates, expected: Line | None) -> NDArray[np.bool_]:
+    """Candidates within the window, and near the expected line if there is one."""
+    x = grid.x[found.row]
+    keep: NDArray[np.bool_] = x <= (x.min() + WINDOW if x.size else 0.0)
+    if expected is not None:
+        d = x - expected.near
+        keep &= np.abs(expected.offset + expected.slope * d + 0.5 * expected.bend * d * d - found.y) < 1.5 * GATE + 0.3 * d
+    return keep
+
+
+def _through(x: Vector, y: Vector, picks: NDArray[np.int64]) -> Vector:
+    """Parabolas [c0, c1, c2] through triples of points that are apart, not too steep and not too bent (k, 3)."""
+    px, py = x[picks], y[picks]
+    apart = np.minimum(np.minimum(np.abs(px[:, 0] - px[:, 1]), np.abs(px[:, 1] - px[:, 2])), np.abs(px[:, 0] - px[:, 2]))
+    ok = apart > 0.05
+    px, py = px[ok], py[ok]
+    if px.size == 0:
+        return np.empty((0, 3))
+    curves = np.linalg.solve(np.stack([np.ones_like(px), px, px * px], axis=2), py[:, :, None])[:, :, 0]
+    slope = curves[:, 1] + 2.0 * curves[:, 2] * px.min(axis=1)
+    kept: Vector = curves[(np.abs(slope) < STEEPEST) & (np.abs(curves[:, 2]) < 2.5)]
+    return kept
+
+
+def chain_about(grid: ScanGrid, found: Candidates, curve: Vector) -> Sight:
+    """The line that goes on from a parabola's inliers: they seed a chain, so that it is followed beyond the window."""
+    x = grid.x[found.row]
+    inlier = np.abs(curve[0] + curve[1] * x + curve[2] * x * x - found.y) < INLIER
+    if int(inlier.sum()) < 5:
+        return UNSEEN
+    near = float(x[inlier].min())
+    slope, bend = float(curve[1] + 2.0 * curve[2] * near), float(2.0 * curve[2])
+    line = Line(near, near + WINDOW, float(curve[0] + curve[1] * near + curve[2] * near * near), slope, bend)
+    return chain(grid, found, line)
+
+
+OFFSETS = np.arange(-0.36, 0.361, 0.02)
+SLOPES = np.arange(-0.75, 0.751, 0.15)
+BENDS = np.array([-1.6, -0.8, 0.0, 0.8, 1.6])
+
+
+class TemplateBank:
+    """A detector that tries whole lines: parabolas on a lattice of offset, slope and bend, scored by ridge strength.
+
+    Every row votes, so noise and dim light matter least; it costs most, and bends between the lattice's are refined by a
+    weighted fit around the best one.
+    """
+
+    def __init__(self) -> None:
+        self._grid: ScanGrid | None = None
+
+    def __call__(self, grid: ScanGrid, samples: Grey, width: float, expected: Line | None) -> Sight:
+        """Find the line."""
+        if self._grid is not grid:
+            self._lay_out(grid)
+        strength = ridge_strength(grid, samples, width)
+        votes = np.minimum(strength[: self._rows], np.float32(contrast_threshold(samples)))
+        score = votes.ravel().take(self._at).sum(axis=1)
+        if expected is not None:
+            score = np.where(np.abs(self._start - expected.at(float(grid.x[0]))) < GATE + 0.02, score, 0.0)
+        best = int(score.argmax())
+        if score[best] < 0.5 * self._rows * contrast_threshold(samples):
+            return UNSEEN
+        return self._refined(grid, strength, best)
+
+    def _lay_out(self, grid: ScanGrid) -> None:
+        """Columns of each parabola in each row, for this grid."""
+        self._grid, self._rows = grid, int(np.searchsorted(grid.x, grid.x[0] + WINDOW))
+        d = grid.x[: self._rows] - grid.x[0]
+        offset, slope, bend = (a.ravel() for a in np.meshgrid(OFFSETS, SLOPES, BENDS, indexing="ij"))
+        y = offset[:, None] + slope[:, None] * d + 0.5 * bend[:, None] * d * d
+        inside = np.abs(y).max(axis=1) < grid.y[-1]
+        y, self._start = y[inside], offset[inside]
+        column = np.rint((y - grid.y[0]) / grid.step).astype(np.intp)
+        self._lines = y
+        self._at = np.arange(self._rows, dtype=np.intp)[None, :] * grid.y.size + column
+
+    def _refined(self, grid: ScanGrid, strength: Grey, best: int) -> Sight:
+        """Centres of gravity around the best parabola, smoothed by a weighted fit, and the line beyond it."""
+        rows = np.arange(self._rows)
+        half = round(0.04 / grid.step)
+        columns = np.rint((self._lines[best] - grid.y[0]) / grid.step).astype(np.intp)
+        columns = np.clip(columns[:, None] + np.arange(-half, half + 1)[None, :], 0, grid.y.size - 1)
+        weight = strength[rows[:, None], columns].astype(float)
+        mass = weight.sum(axis=1)
+        heavy = mass > 0.25 * mass.max()
+        if int(heavy.sum()) < 5:
+            return UNSEEN
+        y = (weight * grid.y[columns]).sum(axis=1)[heavy] / mass[heavy]
+        x = grid.x[: self._rows][heavy]
+        c = polynomial(x - x[0], y, 2, mass[heavy])
+        found = Candidates(rows[heavy], y, mass[heavy])
+        line = Line(float(x[0]), float(x[-1]), c[0], c[1], 2.0 * c[2])
+        beyond = _beyond(grid, strength, self._rows)
+        return chain(grid, _joined(found, beyond), line)
+
+
+def _beyond(grid: ScanGrid, strength: Grey, first: int) -> Candidates:
+    """The strongest spot of each row from `first` on."""
+    rest = strength[first:]
+    column = rest.argmax(axis=1)
+    value = rest[np.arange(rest.shape[0]), column].astype(float)
+    ok = value > LEAST_RIDGE
+    return Candidates(np.nonzero(ok)[0] + first, grid.y[column[ok]], value[ok])
+
+
+LEAST_RIDGE = 20.0
+"""Grey levels of a ridge beyond the window of the template."""
+
+
+def _joined(a: Candidates, b: Candidates) -> Candidates:
+    return Candidates(
+        np.concatenate([a.row, b.row]), np.concatenate([a.y, b.y]), np.concatenate([a.strength, b.strength])
+    )

@@ -1,0 +1,135 @@
+"""The rover and its track as numbers: read from a file like `rover.toml`, SI units."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from importlib.resources import files
+from typing import Any, Self
+
+NOMINAL = "rover.toml"
+
+
+class ModelError(ValueError):
+    """A file of numbers lacks a key or holds a value that cannot be; the message names file, key and remedy."""
+
+
+@dataclass(frozen=True)
+class _Table:
+    """A table of positive numbers; every field is a key of it."""
+
+    @classmethod
+    def of(cls, tables: Mapping[str, Any], name: str, source: str) -> Self:
+        """From a file's tables. Raises ModelError."""
+        table = tables.get(name)
+        if not isinstance(table, Mapping):
+            raise ModelError(f"{source}: table [{name}] is missing; see the one that comes with petrobot, {NOMINAL}")
+        return cls(**{field.name: _number(table, name, field.name, source) for field in fields(cls)})
+
+
+@dataclass(frozen=True)
+class Track(_Table):
+    """The contest's floor (m)."""
+
+    square: float
+    width: float
+    radius: float
+    reflector_height: float
+    bar_length: float
+    bar_width: float
+
+
+@dataclass(frozen=True)
+class Wheels(_Table):
+    """The differential drive: m, rad/s and rad/s^2 of a wheel, s."""
+
+    wheel_radius: float
+    track_width: float
+    top_speed: float
+    acceleration: float
+    quick_stop: float
+    wheel_lag: float
+
+
+@dataclass(frozen=True)
+class Bus(_Table):
+    """The CAN bus: period of SYNC (s) and node ids."""
+
+    period: float
+    left: float
+    right: float
+    sensor: float
+
+
+@dataclass(frozen=True)
+class CameraModel(_Table):
+    """The camera ahead of the axle: m, rad down from the horizon, pixels, images/s."""
+
+    forward: float
+    height: float
+    pitch: float
+    width: float
+    height_px: float
+    focal_px: float
+    rate: float
+    principal_px: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Sensor(_Table):
+    """The retroreflector sensor ahead of the axle: m, s, rad to each side."""
+
+    forward: float
+    height: float
+    period: float
+    half_angle: float
+    range: float
+
+
+@dataclass(frozen=True)
+class Rover:
+    """All numbers of one rover."""
+
+    track: Track
+    wheels: Wheels
+    bus: Bus
+    camera: CameraModel
+    sensor: Sensor
+
+
+def read_rover(text: str, source: str = NOMINAL) -> Rover:
+    """A rover from the text of a TOML file. Raises ModelError."""
+    try:
+        tables = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as fault:
+        raise ModelError(f"{source}: no TOML ({fault}); mend that line") from fault
+    return Rover(
+        Track.of(tables, "track", source),
+        Wheels.of(tables, "rover", source),
+        Bus.of(tables, "bus", source),
+        CameraModel.of(tables, "camera", source),
+        Sensor.of(tables, "sensor", source),
+    )
+
+
+@lru_cache(maxsize=1)
+def nominal_rover() -> Rover:
+    """The rover that comes with petrobot."""
+    return read_rover(files("services.mobile").joinpath(NOMINAL).read_text(encoding="utf-8"))
+
+
+def _number(table: Mapping[str, Any], name: str, key: str, source: str) -> Any:
+    value = table.get(key)
+    if key == "principal_px":
+        if isinstance(value, list) and len(value) == 2 and all(_positive(v) for v in value):
+            return float(value[0]), float(value[1])
+        raise ModelError(f"{source}: [{name}] {key} = {value!r}: give two positive numbers, column and row in pixels")
+    if not _positive(value):
+        raise ModelError(f"{source}: [{name}] {key} = {value!r}: a positive number is needed")
+    return float(value)
+
+
+def _positive(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and value > 0

@@ -1,0 +1,165 @@
+"""What one image shows of the track: points of its centre line, and offset, heading and curvature made of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+
+FIT_REACH = 0.5
+"""m ahead of the nearest point over which one parabola describes the line."""
+POINT_SPACING = 0.05
+"""m between points that are streamed."""
+STREAMED = 12
+"""Most points in a set point."""
+HEAD = 5
+"""Numbers of a set point before its points."""
+
+
+class TrackEnd(IntEnum):
+    """How the line ends within view."""
+
+    NONE = 0
+    """It goes on out of view, or it is not known yet how it ends."""
+    INTERRUPTION = 1
+    """The next square carries no track."""
+    T = 2
+    """The crossbar."""
+
+
+@dataclass(frozen=True, slots=True)
+class End:
+    """Where (m, body frame at exposure) and how the line ends."""
+
+    kind: TrackEnd
+    x: float
+    y: float
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """The line in one image, body frame at exposure: `x` ascending, `y` to the left (m); empty when none was seen.
+
+    `confidence` is 0 to 1: the share of rows within reach in which the line was found.
+    """
+
+    x: Vector
+    y: Vector
+    confidence: float = 0.0
+    end: End | None = None
+    broke_off: bool = False
+    """Whether rows that should show more of the line do not."""
+
+    @property
+    def seen(self) -> bool:
+        """Whether there is a line."""
+        return self.x.size > 2
+
+    def describe(self) -> Line:
+        """Offset, heading and curvature over the first half metre. Raises ValueError when no line was seen."""
+        if not self.seen:
+            raise ValueError("no line was seen")
+        near = self.x <= self.x[0] + FIT_REACH
+        return fit_line(self.x[near], self.y[near])
+
+
+UNSEEN = Sight(np.empty(0), np.empty(0))
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A parabola y = offset + slope (x - near) + bend (x - near)^2 / 2 over [near, far] (m, body frame)."""
+
+    near: float
+    far: float
+    offset: float
+    slope: float
+    bend: float
+
+    @property
+    def heading(self) -> float:
+        """Direction at `near` (rad from straight ahead, to the left positive)."""
+        return math.atan(self.slope)
+
+    @property
+    def curvature(self) -> float:
+        """At `near` (1/m, to the left positive)."""
+        return self.bend / (1.0 + self.slope * self.slope) ** 1.5
+
+    def at(self, x: float) -> float:
+        """y at a distance x (m)."""
+        d = x - self.near
+        return self.offset + self.slope * d + 0.5 * self.bend * d * d
+
+
+def fit_line(x: Vector, y: Vector) -> Line:
+    """Least-squares parabola through points, a straight line through fewer than five."""
+    near, far = float(x[0]), float(x[-1])
+    degree = 2 if x.size >= 5 and far - near > 0.15 else 1
+    coefficients = polynomial(x - near, y, degree)
+    bend = 2.0 * coefficients[2] if degree == 2 else 0.0
+    return Line(near, far, coefficients[0], coefficients[1], bend)
+
+
+def polynomial(x: Vector, y: Vector, degree: int, weights: Vector | None = None) -> list[float]:
+    """Coefficients, constant first, of the weighted least-squares polynomial. Raises LinAlgError for too few places."""
+    powers = [np.ones_like(x)]
+    for _ in range(2 * degree):
+        powers.append(powers[-1] * x)
+    w = np.ones_like(x) if weights is None else weights
+    moments = [float(w @ p) for p in powers]
+    wy = w * y
+    right = [float(wy @ p) for p in powers[: degree + 1]]
+    matrix = [[moments[i + j] for j in range(degree + 1)] for i in range(degree + 1)]
+    solved: list[float] = np.linalg.solve(np.array(matrix), np.array(right)).tolist()
+    return solved
+
+
+@dataclass(frozen=True, slots=True)
+class TrackAhead:
+    """A set point of the stream `track_ahead`: [age, confidence, end, end_x, end_y, x1, y1, x2, y2, ...].
+
+    `age` s since mid-exposure when it was published; `confidence` 0: no line; `end` a `TrackEnd` at (end_x, end_y); then up to
+    `STREAMED` points of the centre line, near to far (m, body frame at exposure).
+    """
+
+    age: float
+    confidence: float
+    end: End | None = None
+    points: tuple[tuple[float, float], ...] = field(default=())
+
+    def values(self) -> list[float]:
+        """As numbers."""
+        end = self.end or End(TrackEnd.NONE, 0.0, 0.0)
+        flat = [c for point in self.points for c in point]
+        return [self.age, self.confidence, float(end.kind), end.x, end.y, *flat]
+
+    @staticmethod
+    def parse(values: Sequence[float], held: float = 0.0) -> TrackAhead:
+        """From numbers that their sender has stood by for `held` s. Raises ValueError when they are none."""
+        rest = len(values) - HEAD
+        if rest < 0 or rest % 2 or rest // 2 > STREAMED or not all(map(math.isfinite, values)):
+            raise ValueError(f"{len(values)} numbers are no set point of track_ahead: {HEAD} and up to {STREAMED} pairs")
+        age, confidence, kind, x, y = values[:HEAD]
+        if kind not in tuple(TrackEnd) or age < 0.0:
+            raise ValueError(f"track_ahead: age {age}, end {kind}: not a set point")
+        end = None if kind == TrackEnd.NONE else End(TrackEnd(int(kind)), x, y)
+        points = tuple(zip(values[HEAD::2], values[HEAD + 1 :: 2], strict=True))
+        return TrackAhead(age + held, confidence, end, points)
+
+
+def thinned(sight: Sight) -> tuple[tuple[float, float], ...]:
+    """Points of a sight for the stream: the nearest first, at least `POINT_SPACING` apart."""
+    points: list[tuple[float, float]] = []
+    for x, y in zip(sight.x.tolist(), sight.y.tolist(), strict=True):
+        if len(points) == STREAMED:
+            break
+        if not points or math.hypot(x - points[-1][0], y - points[-1][1]) >= POINT_SPACING:
+            points.append((x, y))
+    return tuple(points)
