@@ -1,0 +1,282 @@
+"""The estimates file: what was learned, kept across mission runs in SQLite, and merged between machines.
+
+Every file has an origin of its own, and keeps the sums of each origin apart. A merge takes the later version of each origin's
+sums, so merging is idempotent, commutative and associative: no run counts twice, however often and in whatever order files
+travel. What was reset stays forgotten: its origins are remembered as such.
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+import sqlite3
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from coordinator.learning.estimate import Key, Tally
+from coordinator.learning.estimate import merge as merge_tallies
+from coordinator.learning.learning import Estimates
+from coordinator.learning.moments import Moments
+from coordinator.learning.passage import Flow, PassageKey
+from coordinator.learning.passage import merge as merge_flows
+
+SCHEMA = 1
+APPLICATION = 0x70657472
+""""petr": SQLite's application_id of these files."""
+BUSY = 20.0
+"""Seconds that a command waits for another one that is writing the file."""
+
+TABLES = """
+CREATE TABLE about(name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
+CREATE TABLE tally(origin TEXT, primitive_task TEXT, action TEXT, context TEXT, version INTEGER NOT NULL, body TEXT NOT NULL,
+  PRIMARY KEY(origin, primitive_task, action, context)) WITHOUT ROWID;
+CREATE TABLE flow(origin TEXT, task TEXT, transition_name TEXT, context TEXT, version INTEGER NOT NULL, body TEXT NOT NULL,
+  PRIMARY KEY(origin, task, transition_name, context)) WITHOUT ROWID;
+CREATE TABLE selector(primitive_task TEXT, name TEXT, trials REAL NOT NULL, state TEXT NOT NULL,
+  PRIMARY KEY(primitive_task, name)) WITHOUT ROWID;
+CREATE TABLE forgotten(origin TEXT, primitive_task TEXT, PRIMARY KEY(origin, primitive_task)) WITHOUT ROWID;
+CREATE TABLE mission(id TEXT PRIMARY KEY, records INTEGER NOT NULL) WITHOUT ROWID;
+"""
+
+
+class EstimatesError(Exception):
+    """The estimates file cannot be used: file, what is wrong, remedy."""
+
+
+@dataclass
+class Kept:
+    """What a file holds: all origins' estimates together, selectors' states by (primitive task, selector)."""
+
+    origin: str = ""
+    generation: int = 0
+    """Mission runs learned from so far."""
+    estimates: Estimates = field(default_factory=Estimates)
+    selectors: dict[tuple[str, str], dict[str, Any]] = field(default_factory=dict)
+
+    def states(self, selector: str) -> dict[str, dict[str, Any]]:
+        """States of one kind of selector by primitive task."""
+        return {task: state for (task, name), state in self.selectors.items() if name == selector}
+
+
+class EstimatesFile:
+    """One estimates file. A file that is not there is made at the first writing; reading one that is not there gives nothing."""
+
+    def __init__(self, path: Path, origin: str | None = None) -> None:
+        """`origin`: the name of a new file's origin; None: a random one."""
+        self.path = path
+        self._origin = origin
+
+    # --- reading ---------------------------------------------------------------------------------------------------
+
+    def read(self) -> Kept:
+        """All that the file holds. Raises EstimatesError."""
+        if not self.path.exists():
+            return Kept()
+        with self._open() as db:
+            return self._kept(db)
+
+    def _kept(self, db: sqlite3.Connection) -> Kept:
+        about = dict(db.execute("SELECT name, value FROM about"))
+        kept = Kept(about["origin"], int(about["generation"]))
+        for task, action, context, body in db.execute("SELECT primitive_task, action, context, body FROM tally"):
+            key = Key(task, action, context)
+            kept.estimates.tallies[key] = merge_tallies(kept.estimates.tally(key), _tally(body))
+        for task, name, context, body in db.execute("SELECT task, transition_name, context, body FROM flow"):
+            where = PassageKey(task, name, context)
+            kept.estimates.flows[where] = merge_flows(kept.estimates.flows.get(where, Flow()), _flow(body))
+        for task, name, state in db.execute("SELECT primitive_task, name, state FROM selector"):
+            kept.selectors[task, name] = json.loads(state)
+        return kept
+
+    def records_of(self, mission: str) -> int:
+        """How many records of a mission run have been counted already."""
+        if not self.path.exists():
+            return 0
+        with self._open() as db:
+            row = db.execute("SELECT records FROM mission WHERE id = ?", (mission,)).fetchone()
+            return int(row[0]) if row else 0
+
+    # --- writing ---------------------------------------------------------------------------------------------------
+
+    def add(
+        self,
+        gained: Estimates,
+        selectors: Mapping[str, Mapping[str, Any]],
+        mission: str = "",
+        records: int = 0,
+    ) -> None:
+        """Add what a session gained to this file's own origin, and keep its selectors' states (primitive task -> state).
+
+        `mission`, `records`: remember that so many records of a mission run are counted, so that none counts twice.
+        """
+        with self._writing() as db:
+            origin = _about(db, "origin")
+            for key, tally in gained.tallies.items():
+                _add_tally(db, origin, key, tally)
+            for where, flow in gained.flows.items():
+                _add_flow(db, origin, where, flow)
+            for task, state in selectors.items():
+                _put_selector(db, task, state)
+            db.execute("UPDATE about SET value = CAST(value AS INTEGER) + 1 WHERE name = 'generation'")
+            if mission:
+                db.execute("INSERT OR REPLACE INTO mission VALUES (?, ?)", (mission, records))
+
+    def put_selectors(self, selectors: Mapping[str, Mapping[str, Any]]) -> None:
+        """Replace selectors' states (freezing, overriding by hand)."""
+        with self._writing() as db:
+            for task, state in selectors.items():
+                _put_selector(db, task, state)
+
+    def reset(self, primitive_task: str | None = None, *, selectors_only: bool = False) -> None:
+        """Forget a primitive task (None: everything): selectors' states, and estimates unless `selectors_only`."""
+        with self._writing() as db:
+            which, given = ("WHERE primitive_task = ?", (primitive_task,)) if primitive_task else ("", ())
+            db.execute(f"DELETE FROM selector {which}", given)
+            if selectors_only:
+                return
+            db.execute(
+                f"INSERT OR IGNORE INTO forgotten SELECT DISTINCT origin, primitive_task FROM tally {which}", given
+            )
+            db.execute(f"DELETE FROM tally {which}", given)
+            if primitive_task is None:
+                db.execute("INSERT OR IGNORE INTO forgotten SELECT DISTINCT origin, '' FROM flow")
+                db.execute("DELETE FROM flow")
+            db.execute("UPDATE about SET value = ? WHERE name = 'origin'", (secrets.token_hex(8),))
+
+    def merge(self, other: Path) -> None:
+        """Take in another file. Raises EstimatesError.
+
+        Estimates of each origin: the later version. Selectors: the state that has learned from more trials.
+        """
+        if not other.exists():
+            raise EstimatesError(f"{other}: no such file; give an estimates file that `run --learn` has made")
+        with EstimatesFile(other)._open() as db:
+            rows = {name: db.execute(f"SELECT * FROM {name}").fetchall() for name in ("tally", "flow", "selector")}
+            gone = db.execute("SELECT * FROM forgotten").fetchall()
+        for *_, body in rows["tally"]:
+            _tally(body)
+        with self._writing() as mine:
+            _take_later(mine, "tally", rows["tally"], "origin, primitive_task, action, context")
+            _take_later(mine, "flow", rows["flow"], "origin, task, transition_name, context")
+            for task, name, trials, state in rows["selector"]:
+                mine.execute(
+                    "INSERT INTO selector VALUES (?1, ?2, ?3, ?4) ON CONFLICT DO UPDATE SET trials = ?3, state = ?4 "
+                    "WHERE ?3 > trials",
+                    (task, name, trials, state),
+                )
+            mine.executemany("INSERT OR IGNORE INTO forgotten VALUES (?, ?)", gone)
+            mine.execute(
+                "DELETE FROM tally WHERE EXISTS (SELECT 1 FROM forgotten f WHERE f.origin = tally.origin "
+                "AND f.primitive_task = tally.primitive_task)"
+            )
+            mine.execute(
+                "DELETE FROM flow WHERE EXISTS (SELECT 1 FROM forgotten f WHERE f.origin = flow.origin "
+                "AND f.primitive_task = '')"
+            )
+
+    # --- the database ----------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def _writing(self) -> Iterator[sqlite3.Connection]:
+        """One transaction that sees nobody else's half-written work and makes the file if need be."""
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as fault:
+            raise EstimatesError(f"{self.path}: {fault.strerror}; give a folder that can be made") from fault
+        with self._open() as db:
+            db.execute("BEGIN IMMEDIATE")
+            if db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0:
+                self._make(db)
+            yield db
+            db.execute("COMMIT")
+
+    def _make(self, db: sqlite3.Connection) -> None:
+        for statement in TABLES.split(";"):
+            if statement.strip():
+                db.execute(statement)
+        db.execute(f"PRAGMA application_id = {APPLICATION}")
+        db.execute(f"PRAGMA user_version = {SCHEMA}")
+        db.execute("INSERT INTO about VALUES ('origin', ?)", (self._origin or secrets.token_hex(8),))
+        db.execute("INSERT INTO about VALUES ('generation', '0')")
+
+    @contextmanager
+    def _open(self) -> Iterator[sqlite3.Connection]:
+        """The database, checked. Every fault of the file becomes an EstimatesError."""
+        try:
+            with closing(sqlite3.connect(self.path, timeout=BUSY, isolation_level=None)) as db:
+                self._check(db)
+                db.execute("PRAGMA journal_mode = WAL")
+                db.execute("PRAGMA synchronous = FULL")
+                yield db
+        except sqlite3.Error as fault:
+            raise EstimatesError(
+                f"{self.path}: {fault}; restore it from a copy, or give --learn another file"
+            ) from fault
+        except (ValueError, KeyError, TypeError) as fault:
+            raise EstimatesError(
+                f"{self.path}: its contents do not fit ({fault}); restore it from a copy, or give another file"
+            ) from fault
+
+    def _check(self, db: sqlite3.Connection) -> None:
+        empty = db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0
+        (application,), (version,) = (db.execute(f"PRAGMA {p}").fetchone() for p in ("application_id", "user_version"))
+        if empty and not application and not version:
+            return
+        if application != APPLICATION:
+            raise EstimatesError(f"{self.path}: a database, but no estimates file; give --learn another file")
+        if version != SCHEMA:
+            raise EstimatesError(
+                f"{self.path}: written with schema {version}, this petrobot reads {SCHEMA}; "
+                f"{'upgrade petrobot' if version > SCHEMA else 'start a new file'} or give another one"
+            )
+
+
+def _about(db: sqlite3.Connection, name: str) -> str:
+    return str(db.execute("SELECT value FROM about WHERE name = ?", (name,)).fetchone()[0])
+
+
+def _add_tally(db: sqlite3.Connection, origin: str, key: Key, gained: Tally) -> None:
+    where = (origin, key.primitive_task, key.action, key.context)
+    row = db.execute(
+        "SELECT body FROM tally WHERE origin = ? AND primitive_task = ? AND action = ? AND context = ?", where
+    ).fetchone()
+    tally = merge_tallies(_tally(row[0]) if row else Tally(), gained)
+    body = json.dumps(tally.to_plain(), separators=(",", ":"))
+    db.execute("INSERT OR REPLACE INTO tally VALUES (?, ?, ?, ?, ?, ?)", (*where, tally.changes, body))
+
+
+def _add_flow(db: sqlite3.Connection, origin: str, key: PassageKey, gained: Flow) -> None:
+    where = (origin, key.task, key.transition, key.context)
+    row = db.execute(
+        "SELECT body FROM flow WHERE origin = ? AND task = ? AND transition_name = ? AND context = ?", where
+    ).fetchone()
+    flow = merge_flows(_flow(row[0]) if row else Flow(), gained)
+    body = json.dumps([flow.fired, flow.waits.to_plain()])
+    db.execute("INSERT OR REPLACE INTO flow VALUES (?, ?, ?, ?, ?, ?)", (*where, flow.fired, body))
+
+
+def _put_selector(db: sqlite3.Connection, task: str, state: Mapping[str, Any]) -> None:
+    trials = sum(float(learner["k"]) for learner in state["learners"].values())
+    body = json.dumps(state, separators=(",", ":"))
+    db.execute("INSERT OR REPLACE INTO selector VALUES (?, ?, ?, ?)", (task, state["selector"], trials, body))
+
+
+def _take_later(db: sqlite3.Connection, table: str, rows: list[tuple[Any, ...]], key: str) -> None:
+    marks = ", ".join("?" for _ in range(key.count(",") + 3))
+    db.executemany(
+        f"INSERT INTO {table} VALUES ({marks}) ON CONFLICT({key}) DO UPDATE SET version = excluded.version, "
+        "body = excluded.body WHERE excluded.version > version",
+        rows,
+    )
+
+
+def _tally(body: str) -> Tally:
+    return Tally.of_plain(json.loads(body))
+
+
+def _flow(body: str) -> Flow:
+    fired, waits = json.loads(body)
+    return Flow(int(fired), Moments.of_plain(waits))

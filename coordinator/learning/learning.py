@@ -1,0 +1,160 @@
+"""All that a task has learned: tallies by action and context, how transitions wait, and a selector for each primitive task.
+
+It changes by records alone (`Choice`, `End`, `Correction`, `Passage`), all of them plain data: whoever keeps the records, in a
+journal or in the table of a campaign, derives the same state again by `apply` in the same order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from coordinator.learning.estimate import Key, Tally, merge
+from coordinator.learning.objective import Comparison, Question, compare
+from coordinator.learning.passage import Flow, PassageKey
+from coordinator.learning.passage import merge as merge_flows
+from coordinator.learning.records import Choice, Correction, End, Passage, Record
+from coordinator.learning.selectors import DEFAULT, RuleSelector, make
+from coordinator.task import Task
+
+NOTHING = Tally()
+
+
+@dataclass
+class Estimates:
+    """Tallies and flows of one counter: a machine's file, or what one session has gained."""
+
+    tallies: dict[Key, Tally] = field(default_factory=dict)
+    flows: dict[PassageKey, Flow] = field(default_factory=dict)
+
+    def merged(self, other: Estimates) -> Estimates:
+        """Of both sets of runs."""
+        tallies = {k: merge(self.tally(k), other.tally(k)) for k in sorted({*self.tallies, *other.tallies})}
+        keys = sorted({*self.flows, *other.flows})
+        return Estimates(tallies, {k: merge_flows(self.flows.get(k, Flow()), other.flows.get(k, Flow())) for k in keys})
+
+    def tally(self, key: Key) -> Tally:
+        """What is known of an action in a context; an empty tally if nothing is."""
+        return self.tallies.get(key, NOTHING)
+
+    def of(self, primitive_task: str, context: str | None = None) -> dict[str, dict[str, Tally]]:
+        """Tallies of a primitive task: by action, then by context (only the given one if any)."""
+        out: dict[str, dict[str, Tally]] = {}
+        for key, tally in sorted(self.tallies.items()):
+            if key.primitive_task == primitive_task and context in (None, key.context):
+                out.setdefault(key.action, {})[key.context] = tally
+        return out
+
+    def contexts(self, primitive_task: str) -> tuple[str, ...]:
+        """Contexts in which actions of a primitive task were seen."""
+        return tuple(sorted({k.context for k in self.tallies if k.primitive_task == primitive_task}))
+
+    def apply(self, record: Record, task: str, salt: str) -> None:
+        """Count a record."""
+        if isinstance(record, End):
+            key = Key(record.primitive_task, record.action, record.context)
+            self.tallies[key] = self.tally(key).adding(record.outcome, salt)
+        elif isinstance(record, Correction):
+            key = Key(record.primitive_task, record.action, record.context)
+            self.tallies[key] = self.tally(key).correcting(record.was, record.status, record.cause)
+        elif isinstance(record, Passage):
+            where = PassageKey(task, record.transition, record.context)
+            self.flows[where] = self.flows.get(where, Flow()).adding(record.waited)
+
+
+class Learning:
+    """The learning of one task. `known` are the estimates that it starts with; `gained` those of this session alone."""
+
+    def __init__(
+        self,
+        task: Task,
+        selector: str = DEFAULT,
+        question: Question | None = None,
+        known: Estimates | None = None,
+        salt: str = "",
+    ) -> None:
+        self.task, self.salt = task, salt
+        self.known, self.gained = known or Estimates(), Estimates()
+        self.applied = 0
+        """Records taken in this session."""
+        self.given = question
+        self.selectors: dict[str, RuleSelector] = {}
+        for p in task.primitive_tasks.values():
+            if len(p.alternatives) > 1:
+                self.selectors[p.name] = make(selector, p.alternatives, self.question(p.name))
+
+    def question(self, primitive_task: str) -> Question:
+        """Measure, target and rho for a primitive task: as given, the cost measure as the task file declares it."""
+        given = self.given or Question()
+        return Question(self.task.primitive_tasks[primitive_task].cost, given.target, given.rho, given.level)
+
+    # --- choosing and learning -------------------------------------------------------------------------------------
+
+    def choose(
+        self, primitive_task: str, context: str, alternatives: Sequence[str], rng: np.random.Generator
+    ) -> tuple[str, str]:
+        """One of the alternatives, and why. Changes nothing."""
+        return self.selectors[primitive_task].choose(context, alternatives, rng)
+
+    def apply(self, record: Record) -> None:
+        """Take a record in: estimates and selectors change."""
+        self.applied += 1
+        self.gained.apply(record, self.task.name, self.salt)
+        self._select(record)
+
+    def _select(self, record: Record) -> None:
+        if isinstance(record, Passage):
+            return
+        selector = self.selectors.get(record.primitive_task)
+        if selector is None:
+            return
+        if isinstance(record, Choice):
+            selector.chosen(record.context, record.action)
+        elif isinstance(record, End):
+            selector.update(record.context, record.action, record.outcome)
+        elif record.was.status is not None:
+            selector.correct(record.context, record.action, record.was.status, record.status)
+
+    # --- reading ---------------------------------------------------------------------------------------------------
+
+    @property
+    def estimates(self) -> Estimates:
+        """All that is known, this session's runs included."""
+        return self.known.merged(self.gained)
+
+    def comparison(self, primitive_task: str, context: str | None = None) -> Comparison:
+        """The alternatives of a primitive task judged: in one context, or over all of them as scenarios (None)."""
+        tallies = self.estimates.of(primitive_task, context)
+        alternatives = self.task.primitive_tasks[primitive_task].alternatives
+        return compare({a: tallies.get(a, {}) for a in alternatives}, self.question(primitive_task))
+
+    # --- state -----------------------------------------------------------------------------------------------------
+
+    def prime(self) -> None:
+        """Have the selectors take their sums from the known estimates: other machines' runs may have come in."""
+        for name, selector in self.selectors.items():
+            for context in self.known.contexts(name):
+                by_action = self.known.of(name, context)
+                selector.prime(context, {a: t[context] for a, t in by_action.items()})
+
+    def state(self) -> dict[str, Any]:
+        """The selectors' states by primitive task, as plain data."""
+        return {name: selector.state() for name, selector in self.selectors.items()}
+
+    def restore(self, states: Mapping[str, Mapping[str, Any]]) -> None:
+        """Go on from states of the same kind of selector. Raises ValueError naming the primitive task that does not fit."""
+        for name, state in states.items():
+            if name not in self.selectors:
+                continue
+            try:
+                self.selectors[name].restore(state)
+            except (ValueError, KeyError, TypeError) as fault:
+                raise ValueError(f"{name}: {fault}") from fault
+
+    def freeze(self, frozen: bool = True, primitive_tasks: Iterable[str] | None = None) -> None:
+        """Stop (or go on) learning: a frozen selector chooses what it has learned to be best. Estimates count on."""
+        for name in self.selectors if primitive_tasks is None else primitive_tasks:
+            self.selectors[name].frozen = frozen

@@ -1,0 +1,200 @@
+"""The cost function J = 1 - A R + rho C of primitive actions, and the questions that can be asked of it (paper, section 3).
+
+C of an action over several scenarios is its mean cost in the hardest scenario whose reliability is not below the target R_d;
+which scenarios those are is decided by the lower confidence bound, with hysteresis. rho = 1 / max C over the actions of the one
+primitive task, or declared. All J of a comparison are computed from sums with one rho; J made under different rho are never
+averaged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+from math import inf, isnan, nan
+
+from coordinator.learning.estimate import Tally, merge
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """What is asked: the cost measure, the target reliability R_d, rho (None: 1 / max C) and the confidence level."""
+
+    measure: str = "wall"
+    target: float | None = None
+    rho: float | None = None
+    level: float = 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """One action in one comparison. Costs are in the measure's unit."""
+
+    action: str
+    runs: int
+    reliability: float
+    """R over all runs of the comparison; nan without any."""
+    lower: float
+    upper: float
+    """Confidence bounds of R."""
+    availability: float
+    cost: float
+    """C; nan where nothing is known, inf where no scenario meets the target."""
+    scenario: str | None
+    """The hardest scenario that still meets the target (s*); None: none meets it."""
+    scenarios: tuple[str, ...]
+    """All scenarios that meet the target."""
+    largest_cost: float
+    """The largest mean cost over those scenarios, beside the one in the hardest."""
+    j: float
+    """J with the comparison's common rho; inf for an inadmissible action, nan where nothing is known."""
+
+    @property
+    def effective(self) -> float:
+        """A R: the probability that a started run succeeds."""
+        return self.availability * self.reliability
+
+    @property
+    def admissible(self) -> bool:
+        """Whether some scenario meets the target."""
+        return self.scenario is not None
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """The alternatives of one primitive task judged together, in the order given."""
+
+    rho: float
+    figures: tuple[Figures, ...]
+
+    @property
+    def best(self) -> str | None:
+        """The admissible action with the lowest J; None while nothing is known of any."""
+        known = [f for f in self.figures if not isnan(f.j) and f.j < inf]
+        return min(known, key=lambda f: f.j).action if known else None
+
+    def of(self, action: str) -> Figures:
+        """The figures of one action. Raises KeyError."""
+        for figures in self.figures:
+            if figures.action == action:
+                return figures
+        raise KeyError(action)
+
+
+def cost_weight(costs: Iterable[float]) -> float:
+    """The paper's typical rho: 1 / max C over the actions of which a cost is known; 0 if there is none above 0."""
+    largest = max((c for c in costs if not isnan(c) and c < inf), default=0.0)
+    return 1.0 / largest if largest > 0 else 0.0
+
+
+def objective(reliability: float, cost: float, rho: float, availability: float = 1.0) -> float:
+    """J = 1 - A R + rho C."""
+    return 1.0 - availability * reliability + rho * cost
+
+
+# --- scenarios ---------------------------------------------------------------------------------------------------------
+
+
+def admitted(
+    by_scenario: Mapping[str, Tally], target: float | None, before: Iterable[str] = (), level: float = 0.95
+) -> tuple[str, ...]:
+    """Scenarios in which an action meets the target reliability, given those in which it did `before`.
+
+    One comes in when the lower confidence bound of R reaches the target, and goes out when R itself falls below it: between
+    the two it stays what it was, so the set does not flicker. Without a target all scenarios with runs are in.
+    """
+    inside = set(before)
+    out = []
+    for scenario, tally in sorted(by_scenario.items()):
+        if not tally.runs:
+            continue
+        bound = tally.reliability if scenario in inside else tally.interval(level)[0]
+        if target is None or bound >= target:
+            out.append(scenario)
+    return tuple(out)
+
+
+def hardest(by_scenario: Mapping[str, Tally], inside: Sequence[str]) -> str | None:
+    """The scenario with the lowest reliability among those inside; None if there is none."""
+    return min(inside, key=lambda s: (by_scenario[s].reliability, s), default=None)
+
+
+def compare(
+    actions: Mapping[str, Mapping[str, Tally]],
+    question: Question,
+    before: Mapping[str, Sequence[str]] | None = None,
+) -> Comparison:
+    """Judge the alternatives of a primitive task. `actions` are each action's tallies by scenario.
+
+    `before` is the set of admitted scenarios by action of the last comparison (hysteresis). R is taken over all runs, C in
+    the hardest admitted scenario.
+    """
+    was = before or {}
+    rows = [_row(name, tallies, question, was.get(name, ())) for name, tallies in actions.items()]
+    rho = cost_weight(f.cost for f in rows) if question.rho is None else question.rho
+    return Comparison(rho, tuple(_judged(f, rho) for f in rows))
+
+
+def _row(name: str, tallies: Mapping[str, Tally], question: Question, before: Sequence[str]) -> Figures:
+    whole = reduce(merge, tallies.values(), Tally())
+    inside = admitted(tallies, question.target, before, question.level)
+    worst = hardest(tallies, inside)
+    costs = {s: _mean_cost(tallies[s], question.measure) for s in inside}
+    cost = costs[worst] if worst is not None else (inf if whole.runs else nan)
+    largest = max((c for c in costs.values() if not isnan(c)), default=cost)
+    low, high = whole.interval(question.level)
+    return Figures(
+        name, whole.runs, whole.reliability, low, high, whole.availability, cost, worst, inside, largest, nan
+    )
+
+
+def _mean_cost(tally: Tally, measure: str) -> float:
+    moments = tally.cost(measure)
+    return moments.mean if moments.n else nan
+
+
+def _judged(figures: Figures, rho: float) -> Figures:
+    if isnan(figures.reliability):
+        return figures
+    cost = 0.0 if isnan(figures.cost) else figures.cost
+    j = inf if cost == inf else objective(figures.reliability, cost, rho, figures.availability)
+    return replace(figures, j=j)
+
+
+# --- questions ---------------------------------------------------------------------------------------------------------
+
+
+def break_even(one: Figures, other: Figures) -> float | None:
+    """The rho at which two actions have the same J: below it the more reliable one is better; None if there is none.
+
+    `one` beats `other` iff A R_one - A R_other > rho (C_one - C_other).
+    """
+    gain, price = one.effective - other.effective, one.cost - other.cost
+    if price == 0 or isnan(price) or isnan(gain) or price in (inf, -inf):
+        return None
+    rho = gain / price
+    return rho if rho >= 0 else None
+
+
+def pareto(figures: Iterable[Figures]) -> tuple[Figures, ...]:
+    """The actions that no other one beats in both reliability and cost, cheapest first."""
+    known = sorted(
+        (f for f in figures if not isnan(f.effective) and f.cost < inf), key=lambda f: (f.cost, -f.effective, f.action)
+    )
+    front: list[Figures] = []
+    for f in known:
+        if not front or f.effective > front[-1].effective:
+            front.append(f)
+    return tuple(front)
+
+
+def cost_to_reach(figures: Iterable[Figures], target: float, *, surely: bool = False) -> Figures | None:
+    """The cheapest action whose reliability (`surely`: its lower confidence bound) reaches the target; None: none does."""
+    enough = [f for f in figures if f.availability * (f.lower if surely else f.reliability) >= target and f.cost < inf]
+    return min(enough, key=lambda f: (f.cost, -f.effective, f.action), default=None)
+
+
+def reliability_for(figures: Iterable[Figures], budget: float) -> Figures | None:
+    """The most reliable action whose cost is within the budget; None: none is."""
+    payable = [f for f in figures if f.cost <= budget and not isnan(f.effective)]
+    return max(payable, key=lambda f: (f.effective, -f.cost), default=None)

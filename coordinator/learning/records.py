@@ -1,0 +1,108 @@
+"""What learning learns from: records of choices, ends of runs, corrected verdicts and passages, as plain data and back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from coordinator.learning.estimate import Observation
+from coordinator.task import Executed, Status
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """An action was chosen for a primitive task."""
+
+    primitive_task: str
+    action: str
+    context: str
+
+
+@dataclass(frozen=True, slots=True)
+class End:
+    """A run has ended."""
+
+    primitive_task: str
+    action: str
+    context: str
+    outcome: Observation
+
+
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """A deferred verdict replaces the status of a run that had ended."""
+
+    primitive_task: str
+    action: str
+    context: str
+    was: Observation
+    status: Status
+    cause: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Passage:
+    """A transition fired."""
+
+    transition: str
+    context: str
+    waited: float | None = None
+    """Seconds from the marking that enabled it to its firing, for transitions that only wait for events."""
+
+
+Record = Choice | End | Correction | Passage
+
+
+def to_plain(record: Record) -> dict[str, Any]:
+    """Plain data for journals and tables."""
+    if isinstance(record, Passage):
+        return {"kind": "Passage", "transition": record.transition, "context": record.context, "waited": record.waited}
+    about = {"primitive_task": record.primitive_task, "action": record.action, "context": record.context}
+    if isinstance(record, End):
+        return {"kind": "End", **about, "outcome": _observation(record.outcome)}
+    if isinstance(record, Correction):
+        verdict = {"status": record.status.value, "cause": record.cause}
+        return {"kind": "Correction", **about, "was": _observation(record.was), **verdict}
+    return {"kind": "Choice", **about}
+
+
+def of_plain(data: Mapping[str, Any]) -> Record:
+    """What `to_plain` gave. Raises ValueError or KeyError."""
+    kind = data["kind"]
+    if kind == "Passage":
+        return Passage(str(data["transition"]), str(data["context"]), data["waited"])
+    about = (str(data["primitive_task"]), str(data["action"]), str(data["context"]))
+    if kind == "Choice":
+        return Choice(*about)
+    if kind == "End":
+        return End(*about, _observed(data["outcome"]))
+    if kind == "Correction":
+        return Correction(*about, _observed(data["was"]), Status(data["status"]), str(data["cause"]))
+    raise ValueError(f"{kind!r} is no record of learning")
+
+
+def _observation(seen: Observation) -> dict[str, Any]:
+    return {
+        "status": None if seen.status is None else seen.status.value,
+        "seconds": seen.seconds,
+        "cause": seen.cause,
+        "executed": seen.executed.value,
+        "cpu_seconds": seen.cpu_seconds,
+        "values": dict(seen.values),
+        "preempted_by": seen.preempted_by,
+        "waited": seen.waited,
+    }
+
+
+def _observed(data: Mapping[str, Any]) -> Observation:
+    return Observation(
+        None if data["status"] is None else Status(data["status"]),
+        float(data["seconds"]),
+        str(data["cause"]),
+        Executed(data["executed"]),
+        data["cpu_seconds"],
+        {str(name): float(value) for name, value in data["values"].items()},
+        data["preempted_by"],
+        data["waited"],
+    )

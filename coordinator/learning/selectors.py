@@ -1,0 +1,253 @@
+"""Selectors of one primitive task: a rule, its learners by context, the target reliability, and what people may do to them.
+
+A selector chooses one of the alternatives and says why with its numbers. It learns from `update` alone, so whoever keeps the
+choices and the ends of runs can derive its state again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from coordinator.learning.automata import DiscretisedPursuit, NikolicFu, RewardInaction
+from coordinator.learning.bandits import UCB1, Thompson
+from coordinator.learning.batch import Batch, Mask, Trial
+from coordinator.learning.estimate import Observation, Tally
+from coordinator.learning.objective import Question
+from coordinator.learning.rule import Rule
+from coordinator.learning.target import eligible
+from coordinator.learning.tracking import Tracking
+from coordinator.learning.unlearned import Fixed, RoundRobin
+from coordinator.task import Executed, Status
+
+RULES: Mapping[str, Callable[[], Rule]] = {
+    "nikolic_fu": NikolicFu,
+    "nikolic_fu_fast": lambda: NikolicFu("nikolic_fu_fast", k0=0.0, exponent=0.7, mixing=5.0, trials=5),
+    "tracking": Tracking,
+    "reward_inaction": RewardInaction,
+    "discretised_pursuit": DiscretisedPursuit,
+    "ucb1": UCB1,
+    "thompson": Thompson,
+    "fixed": Fixed,
+    "round_robin": RoundRobin,
+}
+"""Every selector by the name that users give."""
+DEFAULT = "nikolic_fu_fast"
+
+
+class Selector(Protocol):
+    """Chooses among the alternatives of one primitive task, and learns from how runs end."""
+
+    name: str
+
+    def choose(self, context: str, alternatives: Sequence[str], rng: np.random.Generator) -> tuple[str, str]:
+        """One of the alternatives, and why. Changes nothing."""
+
+    def chosen(self, context: str, action: str) -> None:
+        """An action was chosen, by this selector or by somebody else."""
+
+    def update(self, context: str, action: str, outcome: Observation) -> None:
+        """A run has ended."""
+
+    def state(self) -> dict[str, Any]:
+        """All that it has learned, as plain data."""
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on from a `state()`. Raises ValueError if it does not fit."""
+
+
+class RuleSelector:
+    """Implements `Selector` with a rule: one learner for each context, all over the same actions.
+
+    `question` gives cost measure, target reliability and rho. `frozen`: nothing is learned, and the learned best is chosen.
+    """
+
+    def __init__(self, rule: Rule, actions: Iterable[str], question: Question | None = None) -> None:
+        self.rule = rule
+        self.name = rule.name
+        self.actions = tuple(actions)
+        self.question = question or Question()
+        self.frozen = False
+        self.learners: dict[str, Batch] = {}
+
+    def learner(self, context: str) -> Batch:
+        """The learner of a context; a fresh one at its first use."""
+        if context not in self.learners:
+            batch = self.rule.begin(1, len(self.actions), self.question.rho)
+            batch.own["admitted"] = np.zeros((1, len(self.actions)))
+            self.learners[context] = batch
+        return self.learners[context]
+
+    # --- choosing --------------------------------------------------------------------------------------------------
+
+    def choose(self, context: str, alternatives: Sequence[str], rng: np.random.Generator) -> tuple[str, str]:
+        """One of the alternatives, and why."""
+        batch, offered = self.learner(context), self._offered(alternatives)
+        if self.frozen:
+            action = int(np.argmax(np.where(offered, self._learned(batch), -1.0)[0]))
+            why = "frozen, the best learned"
+        else:
+            action = int(self.rule.choose(batch, offered, rng.random((1, batch.n)))[0])
+            why = self.rule.says(batch, offered, action)
+        return self.actions[action], f"{self.name}: {why}; {self._figures(batch, action)}{_of(context)}"
+
+    def _learned(self, batch: Batch) -> np.ndarray:
+        """p; for rules that count only, all on the lowest J."""
+        if isinstance(self.rule, Fixed | RoundRobin):
+            return np.eye(batch.n)[batch.best()]
+        return batch.p
+
+    def _offered(self, alternatives: Sequence[str]) -> Mask:
+        offered = np.array([[name in alternatives for name in self.actions]])
+        if not offered.any():
+            raise ValueError(f"none of {', '.join(alternatives)} is among {', '.join(self.actions)}")
+        return offered
+
+    def _figures(self, batch: Batch, action: int) -> str:
+        """J of the chosen action and the lowest J, from the sums."""
+        if not batch.k[0]:
+            return "nothing known yet"
+        j, best = batch.objective()[0], int(batch.best()[0])
+        runs = batch.runs[0]
+        if not np.isfinite(j[action]):
+            return f"no run of it yet; lowest J {j[best]:.3f} {self.actions[best]}"
+        r, c = batch.reliability()[0, action], batch.mean_cost()[0, action]
+        mine = f"J {j[action]:.3f}, R {r:.3f} of {runs[action]:g} runs, C {c:.3g}"
+        return mine if best == action else f"{mine}; lowest J {j[best]:.3f} {self.actions[best]}"
+
+    def probabilities(self, context: str, alternatives: Sequence[str] | None = None) -> dict[str, float]:
+        """With which each alternative (None: all) is chosen next in a context."""
+        batch = self.learner(context)
+        offered = self._offered(self.actions if alternatives is None else alternatives)
+        if self.frozen:
+            best = int(np.argmax(np.where(offered, self._learned(batch), -1.0)[0]))
+            return {name: float(i == best) for i, name in enumerate(self.actions)}
+        return dict(zip(self.actions, self.rule.probabilities(batch, offered)[0].tolist(), strict=True))
+
+    def learned(self, context: str) -> dict[str, float]:
+        """The learned probabilities p, without exploration."""
+        return dict(zip(self.actions, self._learned(self.learner(context))[0].tolist(), strict=True))
+
+    def objective(self, context: str) -> dict[str, float]:
+        """J of each action from the learner's own sums; inf where it was never tried."""
+        return dict(zip(self.actions, self.learner(context).objective()[0].tolist(), strict=True))
+
+    # --- learning --------------------------------------------------------------------------------------------------
+
+    def chosen(self, context: str, action: str) -> None:
+        """Count a choice."""
+        if not self.frozen and action in self.actions:
+            self.learner(context).choosing(np.array([self.actions.index(action)]))
+
+    def update(self, context: str, action: str, outcome: Observation) -> None:
+        """Learn from a run; a censored one teaches nothing."""
+        missing = outcome.executed is Executed.NO and outcome.preempted_by is None
+        if self.frozen or action not in self.actions or (outcome.status is None and not missing):
+            return
+        if outcome.executed is Executed.NO and not missing:
+            return
+        batch = self.learner(context)
+        trial = Trial(
+            np.array([self.actions.index(action)]),
+            np.array([float(outcome.status is Status.SUCCESS)]),
+            np.array([cost_of(outcome, self.question.measure)]),
+            np.array([not missing]),
+        )
+        self.rule.learn(batch, trial, self._eligible(batch))
+
+    def _eligible(self, batch: Batch) -> Mask | None:
+        """Actions that meet the target, judged on what was known before this trial."""
+        if self.question.target is None:
+            return None
+        before = batch.own["admitted"] > 0
+        now = eligible(batch, self.question.target, before, self.question.level)
+        batch.own["admitted"][:] = now
+        return now
+
+    def correct(self, context: str, action: str, was: Status, status: Status) -> None:
+        """A deferred verdict: the sums change once; what was chosen meanwhile stays chosen."""
+        if self.frozen or action not in self.actions:
+            return
+        change = float(status is Status.SUCCESS) - float(was is Status.SUCCESS)
+        batch, i = self.learner(context), self.actions.index(action)
+        batch.successes[0, i] = max(0.0, batch.successes[0, i] + change)
+
+    def prime(self, context: str, tallies: Mapping[str, Tally]) -> None:
+        """Take the sums over from estimates (other machines' runs came in); rules that fade their sums keep their own."""
+        if self.frozen or isinstance(self.rule, Tracking):
+            return
+        batch = self.learner(context)
+        for i, action in enumerate(self.actions):
+            tally = tallies.get(action, Tally())
+            cost, missing = tally.cost(self.question.measure), sum(tally.not_executed.values())
+            batch.runs[0, i], batch.successes[0, i] = tally.runs, tally.count(Status.SUCCESS)
+            batch.cost[0, i], batch.costed[0, i] = cost.total, cost.n
+            batch.missing[0, i] = missing
+            batch.tries[0, i] = max(batch.tries[0, i], tally.runs + missing)
+
+    # --- by hand ---------------------------------------------------------------------------------------------------
+
+    def reset(self, context: str | None = None) -> None:
+        """Forget what was learned, in one context or in all."""
+        for known in list(self.learners) if context is None else [context]:
+            self.learners.pop(known, None)
+
+    def state(self) -> dict[str, Any]:
+        """All that it has learned, as plain data."""
+        return {
+            "selector": self.name,
+            "actions": list(self.actions),
+            "frozen": self.frozen,
+            "learners": {context: batch.to_plain() for context, batch in sorted(self.learners.items())},
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on from a `state()`. Actions that are new are unknown yet, those that are gone are left out."""
+        if state["selector"] != self.name:
+            raise ValueError(f"a state of {state['selector']}, not of {self.name}")
+        self.frozen = bool(state["frozen"])
+        self.learners.clear()
+        for context, data in state["learners"].items():
+            if tuple(state["actions"]) == self.actions:
+                self.learner(context).take_plain(data)
+            else:
+                self._take_moved(context, list(state["actions"]), data)
+
+    def _take_moved(self, context: str, actions: list[str], data: Mapping[str, Any]) -> None:
+        """A state over other actions: sums go with their actions; a new action gets an equal share, the rest is scaled."""
+        batch, old = self.learner(context), self.rule.begin(1, len(actions), self.question.rho)
+        old.own["admitted"] = np.zeros((1, len(actions)))
+        old.take_plain(data)
+        pairs = [(i, actions.index(a)) for i, a in enumerate(self.actions) if a in actions]
+        kept = sum(old.p[0, j] for _, j in pairs)
+        for i, j in pairs:
+            for name in ("tries", "runs", "successes", "cost", "costed", "missing"):
+                getattr(batch, name)[0, i] = getattr(old, name)[0, j]
+            if kept > 0:
+                batch.p[0, i] = old.p[0, j] / kept * len(pairs) / batch.n
+        batch.p /= batch.p.sum()
+        # the gain starts again, so that a newcomer can still win; the sums of the others are not lost
+
+
+def cost_of(outcome: Observation, measure: str) -> float:
+    """A run's cost by a measure; nan where it was not measured."""
+    if measure == "wall":
+        return outcome.seconds
+    if measure == "count":
+        return 1.0
+    if measure == "cpu":
+        return float("nan") if outcome.cpu_seconds is None else outcome.cpu_seconds
+    return float(outcome.values.get(measure.removeprefix("value:"), float("nan")))
+
+
+def make(name: str, actions: Iterable[str], question: Question | None = None) -> RuleSelector:
+    """A selector by its name. Raises ValueError for an unknown one."""
+    if name not in RULES:
+        raise ValueError(f"no selector {name!r}; there are: {', '.join(RULES)}")
+    return RuleSelector(RULES[name](), actions, question)
+
+
+def _of(context: str) -> str:
+    return f" ({context})" if context else ""

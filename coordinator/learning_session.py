@@ -1,0 +1,126 @@
+"""One mission run that learns: opened on an estimates file, written down for a resume, and saved once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from coordinator.estimates_file import EstimatesError, EstimatesFile, Kept
+from coordinator.learner import Contexts, LearningSelector, usual_contexts
+from coordinator.learning.learning import Estimates, Learning
+from coordinator.learning.objective import Question
+from coordinator.learning.selectors import DEFAULT, RULES
+from coordinator.task import Task
+
+
+@dataclass(frozen=True)
+class LearningSetting:
+    """How a mission run learns. `contexts`: what is told apart (None: the regime, if the task has one)."""
+
+    path: Path
+    selector: str = DEFAULT
+    target: float | None = None
+    """Target reliability: among actions that meet it, the lowest J; None: the lowest J of all."""
+    contexts: tuple[str, ...] | None = None
+    chosen: Mapping[str, str] = field(default_factory=dict)
+    """Actions that the user fixed, by primitive task."""
+    frozen: bool = False
+    """Choose by what was learned, and write nothing."""
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain data for a journal's header."""
+        return {
+            "path": str(self.path.resolve()),
+            "selector": self.selector,
+            "target": self.target,
+            "contexts": None if self.contexts is None else list(self.contexts),
+            "chosen": dict(self.chosen),
+            "frozen": self.frozen,
+        }
+
+    @classmethod
+    def of_plain(cls, data: Mapping[str, Any]) -> LearningSetting:
+        """What `to_plain` gave."""
+        contexts = None if data["contexts"] is None else tuple(data["contexts"])
+        return cls(Path(data["path"]), data["selector"], data["target"], contexts, data["chosen"], data["frozen"])
+
+
+class LearningSession:
+    """The learning of one mission run, between an estimates file and the executor.
+
+    `begun`: the selectors' states and the generation when the run began, as `beginning()` gave them (for a resumed run; None:
+    as the file has them). Raises EstimatesError, ContextError, ValueError.
+    """
+
+    def __init__(self, task: Task, setting: LearningSetting, seed: int, begun: Mapping[str, Any] | None = None) -> None:
+        if setting.selector not in RULES:
+            raise ValueError(f"no selector {setting.selector!r}; there are: {', '.join(RULES)}")
+        self.setting = setting
+        self.file = EstimatesFile(setting.path)
+        if setting.frozen and not setting.path.exists():
+            raise EstimatesError(f"{setting.path}: no such file, so nothing was learned to be frozen; learn first")
+        kept = self.file.read()
+        contexts = usual_contexts(task) if setting.contexts is None else Contexts(setting.contexts)
+        generation = kept.generation if begun is None else int(begun["generation"])
+        self.learning = _learning(task, setting, kept, None if begun is None else begun["selectors"])
+        self._generation = generation
+        self._begun = self.learning.state()
+        self.selector = LearningSelector(
+            self.learning, contexts, setting.chosen, seed=seed, generation=generation, live=not setting.frozen
+        )
+
+    def beginning(self) -> dict[str, Any]:
+        """Plain data from which a resumed run derives the same choices again."""
+        return {**self.setting.to_plain(), "generation": self._generation, "selectors": self._begun}
+
+    def save(self, mission: str = "") -> int:
+        """Add what was learned to the file; gives the number of runs that were counted.
+
+        `mission`: the id of a mission run that may be resumed; what was saved of it before is not counted again.
+        """
+        if self.setting.frozen:
+            return 0
+        done = self.file.records_of(mission) if mission else 0
+        gained = self.learning.gained if not done else self._gained_after(done)
+        self.file.add(gained, self.learning.state(), mission, len(self.selector.records))
+        return sum(t.runs + t.censored for t in gained.tallies.values())
+
+    def _gained_after(self, done: int) -> Estimates:
+        gained = Estimates()
+        for record in self.selector.records[done:]:
+            gained.apply(record, self.learning.task.name, self.learning.salt)
+        return gained
+
+
+def _learning(
+    task: Task, setting: LearningSetting, kept: Kept, states: Mapping[str, Mapping[str, Any]] | None
+) -> Learning:
+    question = Question(target=setting.target)
+    salt = f"{kept.origin}/{kept.generation}"
+    learning = Learning(task, setting.selector, question, kept.estimates, salt)
+    try:
+        learning.restore(kept.states(setting.selector) if states is None else states)
+    except ValueError as fault:
+        raise EstimatesError(
+            f"{setting.path}: the state of selector {setting.selector} does not fit: {fault}; "
+            "reset it with `petrobot learned reset`"
+        ) from fault
+    if states is None:
+        learning.prime()
+    if setting.frozen:
+        learning.freeze()
+    return learning
+
+
+def session_of(task: Task, header: Mapping[str, Any]) -> LearningSession | None:
+    """The session of a recorded run, as it began; None if it did not learn."""
+    begun = header.get("learning")
+    return None if begun is None else LearningSession(task, LearningSetting.of_plain(begun), header["seed"], begun)
+
+
+def fixed_by_user(header: Mapping[str, Any]) -> Mapping[str, str]:
+    """The actions that the user of a recorded run had fixed."""
+    chosen: Mapping[str, str] = header.get("chosen", {})
+    return chosen
