@@ -252,7 +252,7 @@ class Executor:
     def _choose(self, choose: Choose) -> Chosen:
         if choose.subject is Subject.ACTION:
             offered = tuple(a for a in choose.alternatives if a in self.directory.actions) or choose.alternatives
-            return Chosen(choose.key, *self.selector.choose(choose.of, choose.key, offered))
+            return Chosen(choose.key, *self.selector.choose(choose.of, choose.key, offered, self.state.variables))
         draw = np.random.default_rng([self.seed, *choose.key.encode()]).random() * sum(choose.weights)
         bounds = np.cumsum(choose.weights)
         index = min(int(np.searchsorted(bounds, draw, side="right")), len(bounds) - 1)
@@ -393,4 +393,5 @@ def _run_ended(run: str, outcome: Outcome) -> RunEnded:
         Executed(outcome.executed),
         dict(outcome.values),
         outcome.seconds,
+        cpu_seconds=outcome.cpu_seconds,
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from coordinator.engine import Instruction, State, Stimulus
 from services.comm.notice import Progress
@@ -12,8 +12,10 @@ from services.comm.notice import Progress
 class Selector(Protocol):
     """Chooses among the alternatives of a primitive task."""
 
-    def choose(self, task: str, run: str, alternatives: tuple[str, ...]) -> tuple[str, str]:
-        """One alternative and why."""
+    def choose(
+        self, task: str, run: str, alternatives: tuple[str, ...], variables: Mapping[str, Any] | None = None
+    ) -> tuple[str, str]:
+        """One alternative and why. `variables` are global memory and parameters as they are now."""
 
 
 class Store(Protocol):
@@ -33,6 +35,7 @@ class Store(Protocol):
         """Whether nothing waits for a sync."""
 
 
+@runtime_checkable
 class Observer(Protocol):
     """Whoever follows the mission run: report, page, terminal."""
 
@@ -77,7 +80,9 @@ class FirstAlternative:
         if action is not None:
             self._overridden[task] = action
 
-    def choose(self, task: str, run: str, alternatives: tuple[str, ...]) -> tuple[str, str]:
+    def choose(
+        self, task: str, run: str, alternatives: tuple[str, ...], variables: Mapping[str, Any] | None = None
+    ) -> tuple[str, str]:
         """The user's choice for this primitive task, else the first."""
         if task in self._overridden:
             return self._overridden[task], "chosen by the operator"

@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 import asyncio
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
 from coordinator.cli.replaying import Recorded, recorded
 
 if TYPE_CHECKING:
     from coordinator.mission import Mission
+    from coordinator.partners import Observer
     from coordinator.timeline import Timeline
 
 EXAMPLE = "petrobot resume last --json out.json"
@@ -42,17 +43,18 @@ def run(options: argparse.Namespace) -> int:
         raise CommandError(2, f"{options.run} was run in lock step: run it again with its seed, it gives the same")
     begun = time.perf_counter()
     try:
-        mission, timeline = asyncio.run(_resume(found, options))
+        mission, timeline, learned = asyncio.run(_resume(found, options))
     except MissionError as fault:
         raise CommandError(1, str(fault)) from fault
     except (JournalError, ReplayError) as fault:
         raise CommandError(2, str(fault)) from fault
-    result = mission.result("realtime", time.perf_counter() - begun)
+    result = {**mission.result("realtime", time.perf_counter() - begun), **learned}
     give(result, found.task, timeline, options, found.journal.path.parent)
     return 0 if result["status"] == "success" else 1
 
 
-async def _resume(found: Recorded, options: argparse.Namespace) -> tuple[Mission, Timeline]:
+async def _resume(found: Recorded, options: argparse.Namespace) -> tuple[Mission, Timeline, dict[str, Any]]:
+    from coordinator.cli.learning import resumed_selector, saved
     from coordinator.cli.run import drive
     from coordinator.engine import Mode
     from coordinator.launch import resumed_mission
@@ -60,9 +62,12 @@ async def _resume(found: Recorded, options: argparse.Namespace) -> tuple[Mission
 
     timeline = Timeline()
     now = asyncio.get_running_loop().time()
-    mission, go_on = resumed_mission(found.directory, found.task, found.engine, found.journal, [timeline], now)
+    selector, session = resumed_selector(found.task, found.journal.header)
+    observers: list[Observer] = [timeline] if session is None else [timeline, session.selector]
+    mission, go_on = resumed_mission(found.directory, found.task, found.engine, found.journal, observers, now, selector)
     if mission.executor.state.mode in (Mode.FRESH, Mode.FINISHED):
         raise CommandError(2, f"{options.run}: the run {'had ended' if mission.executor.finished else 'had not begun'}")
     options.folder = found.journal.path.parent
-    await drive(found.directory, mission, options, go_on)
-    return mission, timeline
+    with saved(session, found.journal.header["mission"]) as learned:
+        await drive(found.directory, mission, options, go_on)
+    return mission, timeline, learned

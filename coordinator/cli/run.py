@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
+from coordinator.cli.learning import add_learning_arguments, opened, saved
 from coordinator.cli.loading import add_services_argument, load_directory, load_task, write_json
 
 if TYPE_CHECKING:
@@ -50,6 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--up", action="store_true", help="launch the nodes of this host for this run, and end them after it"
     )
     parser.add_argument("--mock", metavar="FILE", type=Path, help="replace actions by scripted ones")
+    add_learning_arguments(parser)
     parser.add_argument("--json", metavar="FILE", help="write the result as JSON (- for standard output)")
     parser.add_argument("--report", metavar="FOLDER", type=Path, help="leave a report in this folder")
     parser.add_argument(
@@ -77,6 +79,7 @@ def add_page_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Check the task, run it, print and write the result."""
+    from coordinator.launch import mission_id
     from coordinator.mission import MissionError
     from services.comm.directory import DirectoryError
 
@@ -86,14 +89,17 @@ def run(options: argparse.Namespace) -> int:
     begun = time.perf_counter()
     try:
         if options.mode == "lockstep":
-            mission, timeline = _run_lockstep(directory, setting, options)
+            with saved(options.learning) as learned:
+                mission, timeline = _run_lockstep(directory, setting, options)
         else:
-            mission, timeline = asyncio.run(_run_realtime(directory, setting, options))
+            options.identity = mission_id(task)
+            with saved(options.learning, options.identity) as learned:
+                mission, timeline = asyncio.run(_run_realtime(directory, setting, options))
     except MissionError as fault:
         raise CommandError(2 if fault.bad_input else 1, str(fault)) from fault
     except DirectoryError as fault:
         raise CommandError(2, str(fault)) from fault
-    result = mission.result(options.mode, time.perf_counter() - begun)
+    result = {**mission.result(options.mode, time.perf_counter() - begun), **learned}
     give(result, task, timeline, options, options.folder)
     return 0 if result["status"] == "success" else 1
 
@@ -131,7 +137,9 @@ def _setting(task: Task, directory: Directory, options: argparse.Namespace) -> S
             raise CommandError(2, f"--use {primitive}={action}: not known to {task.name}; choose among {choices}")
         if action not in directory.actions:
             raise CommandError(2, f"--use {primitive}={action}: {directory.source} places no action {action}")
-    return Setting(task, parameters, options.runs, options.seed, FirstAlternative(chosen))
+    options.learning = opened(task, chosen, options)
+    selector = FirstAlternative(chosen) if options.learning is None else options.learning.selector
+    return Setting(task, parameters, options.runs, options.seed, selector)
 
 
 def _pairs(option: str, texts: list[str]) -> Iterator[tuple[str, str]]:
@@ -226,11 +234,11 @@ def _go(member: Any, until: Callable[[], bool]) -> None:
 async def _run_realtime(
     directory: Directory, setting: Setting, options: argparse.Namespace
 ) -> tuple[Mission, Timeline]:
-    from coordinator.launch import mission_id, realtime_mission
+    from coordinator.launch import realtime_mission
     from coordinator.timeline import Timeline
 
     timeline = Timeline()
-    identity = mission_id(setting.task)
+    identity: str = options.identity
     options.folder = options.journal / identity
     store = _store(directory, setting, options, identity, asyncio.get_running_loop().time())
     mission = realtime_mission(directory, setting, identity, store)
@@ -253,6 +261,8 @@ def _store(
         "seed": setting.seed,
         "runs": with_runs_of(setting),
         "parameters": {**setting.task.parameters, **setting.parameters},
+        "chosen": dict(_pairs("--use", options.use)),
+        **({} if options.learning is None else {"learning": options.learning.beginning()}),
     }
     first = header(mission, task_path(options.task).read_text(encoding="utf-8"), services, options.mode, given)
     return JournalStore(JournalWriter(options.journal / mission / JOURNAL, first), origin)

@@ -38,6 +38,8 @@ class RunEnded:
     """How long it took on the node's clock."""
     deferred: bool = False
     """The status serves for routing; a `Verdict` may correct it once for the estimates."""
+    cpu_seconds: float | None = None
+    """Processor time that it took; None: not measured. It moves nothing, the estimates keep it."""
 
 
 @dataclass(frozen=True, slots=True)
