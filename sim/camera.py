@@ -18,16 +18,13 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sim.occluders import Box, Occluders, fill
 from sim.scenery import Chessboard, Table, floor_grey, supersampled
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 BALL_GREY = 215.0
-ARM_GREY = 120.0
-CUP_GREY = 92.0
-CUP_INSIDE_GREY = 40.0
-CUP_WALL = 0.004
 SHADOW_DEPTH = 0.35
 """Part of the light that the ball takes from the table right below it."""
 NOISE_ZERO = 128
@@ -35,8 +32,6 @@ NOISE_SIZE = 1280
 LIGHT_DIRECTION = np.array([-0.25, 0.35, 0.90]) / np.linalg.norm([-0.25, 0.35, 0.90])
 """Towards the lamp, base frame."""
 LENS_STEPS = 6
-CIRCLE = np.stack([f(np.linspace(0.0, 2.0 * np.pi, 13)[:-1]) for f in (np.cos, np.sin)], axis=-1)
-RING = np.pad(CIRCLE, ((0, 0), (0, 1)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,16 +67,6 @@ class View:
         return cls(**truth)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Cover:
-    """What arm or cup hide: a convex hull (n, 1, 2) in sixteenths of a pixel, its grey level, its height (m)."""
-
-    hull: NDArray[np.int32]
-    grey: float
-    height: float
-    cup: bool
-
-
 class PinholeCamera:
     """The camera of the simulated laboratory. The same generator state and the same calls give the same images."""
 
@@ -101,14 +86,15 @@ class PinholeCamera:
         self.rotation: Array = _looking_down(camera) if view.rotation is None else np.asarray(view.rotation, float)
         self._rng = rng
         self._lamp = (self.rotation @ LIGHT_DIRECTION).astype(np.float32)
-        outer = RING * (self.cup_radius + CUP_WALL)
-        self._cup_rings: Array = np.concatenate([outer, outer - (0.0, 0.0, self.cup_depth), RING * self.cup_radius])
-        self._covered: tuple[bytes, list[_Cover]] = (b"", [])
+        self._turn: list[list[float]] = self.rotation.tolist()
+        self._at: list[float] = self.position.tolist()
+        self._bend: list[float] = self.distortion.tolist()
+        self._occluders = Occluders(self, self.cup_radius, self.cup_depth)
         sigma = float(camera["noise"] if view.noise is None else view.noise)
         field = NOISE_ZERO + sigma * rng.standard_normal((NOISE_SIZE, NOISE_SIZE), np.float32)
         self._noise: Picture = np.clip(np.rint(field), 0, 255).astype(np.uint8)
-        self._brighter: Picture = np.maximum(self._noise, NOISE_ZERO) - np.uint8(NOISE_ZERO)
-        self._darker: Picture = np.uint8(NOISE_ZERO) - np.minimum(self._noise, NOISE_ZERO)
+        self._grain: Picture = self._noise - np.uint8(NOISE_ZERO)
+        """The noise to add, modulo 256."""
 
     def reseed(self, rng: np.random.Generator) -> None:
         """Choose noise by another generator from now on."""
@@ -123,6 +109,19 @@ class PinholeCamera:
     def project(self, points: ArrayLike) -> Array:
         """Pixels (..., 2) of base-frame points (..., 3)."""
         return self._pixels(self.to_camera(points))
+
+    def pixel(self, point: Sequence[float]) -> tuple[float, float, float]:
+        """Pixel (u, v) of one base-frame point (3,) and its depth (m): as `project`, in plain floats."""
+        ax, ay, az = point[0] - self._at[0], point[1] - self._at[1], point[2] - self._at[2]
+        (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = self._turn
+        depth = ax * zx + ay * zy + az * zz
+        x, y = (ax * xx + ay * xy + az * xz) / depth, (ax * yx + ay * yy + az * yz) / depth
+        k1, k2, p1, p2 = self._bend
+        square = x * x + y * y
+        radial = 1.0 + square * (k1 + k2 * square)
+        u = x * radial + 2.0 * p1 * x * y + p2 * (square + 2.0 * x * x)
+        v = y * radial + p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y
+        return self.focal * u + self.cx, self.focal * v + self.cy, depth
 
     def _pixels(self, seen: Array) -> Array:
         """Pixels (..., 2) of points (..., 3) in the camera's frame."""
@@ -170,7 +169,13 @@ class PinholeCamera:
 
     @cached_property
     def _rays(self) -> NDArray[np.float32]:
-        return self.rays(self._grid).astype(np.float32)
+        """Unit directions (3, height, width), camera frame, in which the pixels look."""
+        return np.ascontiguousarray(np.moveaxis(self.rays(self._grid), -1, 0), np.float32)
+
+    @cached_property
+    def _to_lamp(self) -> NDArray[np.float32]:
+        """Those directions' part towards the lamp (height, width)."""
+        return np.asarray(np.tensordot(self._lamp, self._rays, 1), np.float32)
 
     @cached_property
     def illumination(self) -> NDArray[np.float32]:
@@ -200,7 +205,7 @@ class PinholeCamera:
 
     def warm_up(self) -> None:
         """Make all that is made once: in real time the first image must not take longer than the others."""
-        _ = self.background, self._rays
+        _ = self.background, self._canvas, self._to_lamp
 
     def render(
         self,
@@ -216,19 +221,36 @@ class PinholeCamera:
         ball: centre at mid-exposure (3,) m, None: no ball; ball_velocity (3,) m/s; arm_points (n, 2, 3): both ends of each
         capsule of the arm, arm_radii (n,) m; cup_pose (4, 4): the cup's mouth centre with z out of the mouth; light: factor.
         """
-        picture = self.background.copy()
         pose = None if cup_pose is None else np.asarray(cup_pose, float)
-        covers = self._covers(arm_points, arm_radii, pose)
+        points = np.empty((0, 2, 3)) if arm_points is None else np.asarray(arm_points, float).reshape(-1, 2, 3)
+        covers = self._occluders.covers(points, np.asarray(arm_radii, float).ravel(), pose)
+        changed = [cover.box for cover in covers]
+        picture = self._canvas
         if ball is None:
-            self._fill(picture, covers)
+            fill(picture, covers)
         else:
             centre = np.asarray(ball, float)
             in_cup = pose is not None and self._inside_cup(centre, pose)
             above = [cover for cover in covers if cover.height > centre[2] and not (cover.cup and in_cup)]
-            self._fill(picture, [cover for cover in covers if cover not in above])
-            self._paint_ball(picture, centre, np.asarray(ball_velocity, float))
-            self._fill(picture, above)
-        return self._expose(picture, light)
+            fill(picture, [cover for cover in covers if cover not in above])
+            box = self._paint_ball(picture, centre, np.asarray(ball_velocity, float))
+            changed += [] if box is None else [box]
+            fill(picture, above)
+        image = self._expose(picture, light, changed)
+        for box in changed:
+            picture[box] = self.background[box]
+        return image
+
+    @cached_property
+    def _canvas(self) -> Picture:
+        """The background, on which an image is painted; `render` puts back what it changes."""
+        return self.background.copy()
+
+    @cached_property
+    def _sound(self) -> bool:
+        """Whether noise never takes the background beyond black or white, so that it may be added without a look."""
+        noise, scene = self._noise.astype(int) - NOISE_ZERO, self.background
+        return bool(scene.min() + noise.min() >= 0 and scene.max() + noise.max() <= 255)
 
     def render_board(self, pose: ArrayLike, board: Chessboard | None = None, light: float = 1.0) -> Picture:
         """One image of a calibration board held at `pose` (4, 4), board frame to base frame; nothing else in view."""
@@ -247,41 +269,48 @@ class PinholeCamera:
             grey = supersampled(pixels, lambda at: board.grey(point_at(at)), 3) * self.illumination[box]
             seen = board.covers(point_at(pixels))
             picture[box] = np.where(seen, np.clip(np.rint(grey), 0, 255).astype(np.uint8), picture[box])
-        return self._expose(picture, light)
+        return self._expose(picture, light, None)
 
-    def _expose(self, picture: Picture, light: float) -> Picture:
-        """Light and noise over the whole image: a window of the noise field that the generator chooses."""
+    def _expose(self, picture: Picture, light: float, changed: Sequence[Box] | None) -> Picture:
+        """Light and noise over the whole image: a window of the noise field that the generator chooses. Outside the boxes
+        `changed` the picture is the background (None: it may differ anywhere)."""
         row = int(self._rng.integers(NOISE_SIZE - self.height + 1))
         column = int(self._rng.integers(NOISE_SIZE - self.width + 1))
         window = slice(row, row + self.height), slice(column, column + self.width)
-        if light == 1.0:  # the same sum in a third of the time
-            cv2.add(picture, self._brighter[window], picture)
-            return np.asarray(cv2.subtract(picture, self._darker[window], picture), np.uint8)
         noise = self._noise[window]
-        return np.asarray(cv2.addWeighted(picture, light, noise, 1.0, -NOISE_ZERO), np.uint8)
+        if light != 1.0 or changed is None or not self._sound:
+            return np.asarray(cv2.addWeighted(picture, light, noise, 1.0, -NOISE_ZERO), np.uint8)
+        image = self.background + self._grain[window]  # the same sum in a tenth of the time
+        for box in changed:
+            image[box] = cv2.addWeighted(picture[box], 1.0, noise[box], 1.0, -NOISE_ZERO)
+        return image
 
     # Moving things
 
-    def _paint_ball(self, picture: Picture, ball: Array, velocity: Array) -> None:
-        foot = ball - LIGHT_DIRECTION * ((ball[2] - self.table.top) / LIGHT_DIRECTION[2])
-        seen = self.to_camera(np.array((ball, ball + 0.5 * self.exposure * velocity, foot)))
-        (u, v), (later_u, later_v), (foot_u, foot_v) = self._pixels(seen).tolist()
+    def _paint_ball(self, picture: Picture, ball: Array, velocity: Array) -> Box | None:
+        """Ball and shadow; gives the box that they may have changed."""
+        height = float(ball[2]) - self.table.top
+        foot = (ball - LIGHT_DIRECTION * (height / LIGHT_DIRECTION[2])).tolist()
+        (u, v, depth), (foot_u, foot_v, foot_depth) = self.pixel(ball.tolist()), self.pixel(foot)
+        later_u, later_v, _ = self.pixel((ball + 0.5 * self.exposure * velocity).tolist())
         travel_u, travel_v = later_u - u, later_v - v
-        reach = 2.2 * self.ball_radius * self.focal / float(seen[0, 2])
+        reach = 2.2 * self.ball_radius * self.focal / depth
         box = self._box(u, v, reach + abs(travel_u), reach + abs(travel_v))
         if box is None:
-            return
+            return None
         region = picture[box].astype(np.float32)
-        if self.table.contains(foot[0], foot[1]) and 0.0 < ball[2] - self.table.top < 0.2:
-            region *= _shadow(foot_u, foot_v, self.ball_radius * self.focal / float(seen[2, 2]), box)
+        if self.table.contains(foot[0], foot[1]) and 0.0 < height < 0.2:
+            region *= _shadow(foot_u, foot_v, self.ball_radius * self.focal / foot_depth, box)
         near = self._box(u, v, 0.6 * reach + 2.0 + abs(travel_u), 0.6 * reach + 2.0 + abs(travel_v))
         if near is not None:
             (top, left), (rows, columns) = (box[0].start, box[1].start), near
             part = region[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left]
-            cover, shade = self._sphere(seen[0], self.rotation @ velocity, math.hypot(travel_u, travel_v), near)
+            centre = self.rotation @ (ball - self.position)
+            cover, shade = self._sphere(centre, self.rotation @ velocity, math.hypot(travel_u, travel_v), near)
             part *= 1.0 - cover
             part += shade * (BALL_GREY * self.illumination[near])
-        picture[box] = np.rint(np.minimum(region, 255.0, out=region)).astype(np.uint8)
+        picture[box] = np.rint(np.minimum(region, 255.0, out=region), out=region)
+        return box
 
     def _sphere(
         self, centre: Array, velocity: Array, travel: float, box: tuple[slice, slice]
@@ -293,8 +322,8 @@ class PinholeCamera:
         steps = 1 + 2 * math.ceil(travel)
         moments = ((np.arange(steps) + 0.5) / steps - 0.5) * self.exposure
         centres = (centre + moments[:, None] * velocity).astype(np.float32)
-        rays, radius = self._rays[box], np.float32(self.ball_radius)
-        shape, rays = rays.shape[:2], rays.reshape(-1, 3).T
+        rays, to_lamp, radius = self._rays[:, box[0], box[1]], self._to_lamp[box], np.float32(self.ball_radius)
+        shape, rays = to_lamp.shape, rays.reshape(3, -1)
         along = centres @ rays
         square = (centres * centres).sum(axis=1)[:, None] - along * along
         np.maximum(square, 0.0, out=square)
@@ -302,76 +331,18 @@ class PinholeCamera:
         np.minimum(np.maximum(cover, 0.0, out=cover), 1.0, out=cover)
         along -= np.sqrt(np.maximum(radius * radius - square, 0.0))  # now the distance of the ball's surface
         # the surface normal's part towards the lamp: (ray * distance - centre) . lamp / radius
-        facing = (along * (self._lamp @ rays) - (centres @ self._lamp)[:, None]) / radius
+        facing = (along * to_lamp.ravel() - (centres @ self._lamp)[:, None]) / radius
         np.minimum(np.maximum(facing, 0.0, out=facing), 1.0, out=facing)
         shade = cover * (np.float32(0.70) + np.float32(0.30) * facing)
         share = np.full(steps, 1.0 / steps, np.float32)
         return (share @ cover).reshape(shape), (share @ shade).reshape(shape)
 
-    def _box(self, u: float, v: float, reach_u: float, reach_v: float) -> tuple[slice, slice] | None:
-        if not (np.isfinite(u) and np.isfinite(v)):
+    def _box(self, u: float, v: float, reach_u: float, reach_v: float) -> Box | None:
+        if not (math.isfinite(u) and math.isfinite(v)):
             return None
         left, right = max(0, int(u - reach_u)), min(self.width, int(u + reach_u) + 2)
         top, bottom = max(0, int(v - reach_v)), min(self.height, int(v + reach_v) + 2)
         return (slice(top, bottom), slice(left, right)) if left < right and top < bottom else None
-
-    # Arm and cup: patches of one grey level, the same as long as neither moves
-
-    def _covers(self, arm_points: ArrayLike | None, arm_radii: ArrayLike, pose: Array | None) -> list[_Cover]:
-        points = np.empty((0, 2, 3)) if arm_points is None else np.asarray(arm_points, float).reshape(-1, 2, 3)
-        radii = np.asarray(arm_radii, float).ravel()
-        key = points.tobytes() + radii.tobytes() + (b"" if pose is None else pose.tobytes())
-        if key != self._covered[0]:
-            arm = self._arm_covers(points, radii) if len(points) else []
-            self._covered = key, arm + ([] if pose is None else self._cup_covers(pose))
-        return self._covered[1]
-
-    def _arm_covers(self, points: Array, radii: Array) -> list[_Cover]:
-        """The hull of both ends' discs for each capsule that is in view."""
-        if len(points) != len(radii):
-            raise ValueError(f"{len(points)} capsules of the arm, but {len(radii)} radii")
-        seen = self.to_camera(points)
-        depth = seen[..., 2]
-        discs = (radii[:, None] * self.focal / depth)[..., None, None] * CIRCLE
-        rims = (self._pixels(seen)[:, :, None] + discs).reshape(len(points), -1, 2)
-        # at or behind the lens: out of focus anyway
-        sharp = (depth > 4.0 * radii[:, None]).all(axis=1)
-        heights = points[..., 2].mean(axis=1)
-        return [
-            self._cover(rims[part], ARM_GREY, float(heights[part]))
-            for part in np.flatnonzero(sharp & self._in_view(rims)).tolist()
-        ]
-
-    def _cup_covers(self, pose: Array) -> list[_Cover]:
-        """The wall as the hull of both rims, then the dark mouth as far as it faces the camera."""
-        seen = self.to_camera(self._cup_rings @ pose[:3, :3].T + pose[:3, 3])
-        if seen[:, 2].min() < 0.1:
-            return []
-        pixels, height = self._pixels(seen), float(pose[2, 3])
-        wall, mouth = pixels[: 2 * len(RING)], pixels[2 * len(RING) :]
-        if not self._in_view(wall):
-            return []
-        covers = [self._cover(wall, CUP_GREY, height, cup=True)]
-        if (self.position - pose[:3, 3]) @ pose[:3, 2] > 0.0:
-            covers.append(self._cover(mouth, CUP_INSIDE_GREY, height, cup=True))
-        return covers
-
-    def _in_view(self, pixels: Array) -> NDArray[np.bool_]:
-        """Whether some of the box around pixels (..., n, 2) is in the image."""
-        low, high = pixels.min(axis=-2), pixels.max(axis=-2)
-        inside: NDArray[np.bool_] = ((high >= 0.0) & (low < (self.width, self.height))).all(axis=-1)
-        return inside
-
-    def _cover(self, pixels: Array, grey: float, height: float, cup: bool = False) -> _Cover:
-        """The convex hull of pixels in its middle's light."""
-        u, v = (pixels.sum(axis=0) / len(pixels)).tolist()
-        light = self.illumination[min(max(int(v), 0), self.height - 1), min(max(int(u), 0), self.width - 1)]
-        hull = np.asarray(cv2.convexHull(np.rint(pixels * 16).astype(np.int32)), np.int32)
-        return _Cover(hull, grey * float(light), height, cup)
-
-    def _fill(self, picture: Picture, covers: Sequence[_Cover]) -> None:
-        for cover in covers:
-            cv2.fillConvexPoly(picture, cover.hull, cover.grey, cv2.LINE_AA, 4)
 
     def _inside_cup(self, ball: Array, pose: Array) -> bool:
         local = (ball - pose[:3, 3]) @ pose[:3, :3]

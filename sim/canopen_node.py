@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
+from operator import itemgetter
 from typing import Final
 
 from services.comm.canbus import Frame
@@ -142,6 +143,13 @@ class Pdo:
         objects = [self.mapped(self._values[self.mapping, n]) for n in range(1, self._values[self.mapping, 0] + 1)]
         self.layout = pdo_struct(objects)
         self.keys = tuple((mapped.index, mapped.sub) for mapped in objects)
+        self._mapped = itemgetter(*self.keys) if len(self.keys) > 1 else None
+
+    def pack(self) -> bytes:
+        """The values of the mapped objects as they travel."""
+        values = self._values
+        many = self._mapped
+        return self.layout.pack(*([values[key] for key in self.keys] if many is None else many(values)))
 
     def mapped(self, entry: int) -> Mapped:
         """A mapping entry taken apart; raises SdoAbortError if it cannot be mapped."""
@@ -273,9 +281,7 @@ class CanopenNode:
             self.before_sending()
             frame = self._tpdo_frame
             if frame is None:
-                values = self.values
-                data = self.tpdo.layout.pack(*[values[key] for key in self.tpdo.keys])
-                self._tpdo_frame = frame = Frame(self.tpdo.cob_id, data)
+                self._tpdo_frame = frame = Frame(self.tpdo.cob_id, self.tpdo.pack())
             self.outbox.append(frame)
 
     def changed(self) -> None:
@@ -306,7 +312,8 @@ class CanopenNode:
     def sync(self, now: float) -> None:
         """SYNC has come."""
         if self.nmt is NmtState.OPERATIONAL:
-            self._apply_rpdo(now)
+            if self._latched is not None:
+                self._apply_rpdo(now)
             self.on_sync(now)
             if self.tpdo.synchronous:
                 self.send_tpdo()

@@ -121,6 +121,17 @@ class Drive(PowerDrive):
             if not self.servo.standing:
                 self.stir()
 
+    def repeat(self, now: float, answer: Frame) -> None:
+        """SYNC again with the same set point while the joint is at rest: the same answer again."""
+        self._synced = now
+        self.outbox.append(answer)
+
+    @property
+    def tpdo_sent(self) -> Frame | None:
+        """The TPDO sent last, if it was the last frame sent and is not fetched yet."""
+        frame = self._tpdo_frame
+        return frame if frame is not None and self.outbox and self.outbox[-1] is frame else None
+
     def after_configuring(self) -> None:
         """Take over how the drive watches itself."""
         super().after_configuring()
@@ -221,6 +232,10 @@ class DriveBus:
         self._resting, self._stirred = False, True
         self._rests_until = self._due = -math.inf
         self._tau: list[float] = []
+        self._odd = False
+        self._heard: Sequence[Frame] = ()
+        self._echoes: Sequence[Frame] = ()
+        """The set points of the newest cycle that found and left the arm at rest, and the answers, one a drive."""
         self.drives = tuple(Drive(joint, rating, plant, self._stir) for joint, rating in enumerate(drives))
         self.inputs = DigitalInputs(INPUTS_NODE)
         self._nodes: tuple[CanopenNode, ...] = (*self.drives, self.inputs)
@@ -228,6 +243,24 @@ class DriveBus:
         self.errors = 0
         for node in self._nodes:
             node.boot(now)
+
+    def receive_cycle(self, now: float, frames: Sequence[Frame]) -> None:
+        """The frames of one cycle of the master's. Drives at rest that hear what they have heard before answer as before."""
+        if self._echoes and frames == self._heard and self._resting:
+            for drive, echo in zip(self.drives, self._echoes, strict=True):
+                drive.repeat(now, echo)
+            self._rests_until = min([drive.waits_until for drive in self.drives])
+            return
+        resting, self._odd, self._echoes = self._resting, False, ()
+        for frame in frames:
+            self.receive(now, frame)
+        if resting and self._resting and not self._odd and not self.inputs.tpdo.synchronous:
+            self._heard, self._echoes = frames, self._answers()
+
+    def _answers(self) -> Sequence[Frame]:
+        """What each drive has just sent, nothing if one of them sent nothing."""
+        sent = [drive.tpdo_sent for drive in self.drives]
+        return [frame for frame in sent if frame is not None] if None not in sent else ()
 
     def receive(self, now: float, frame: Frame) -> None:
         """A frame of the master's."""
@@ -240,6 +273,7 @@ class DriveBus:
                 node.sync(now)
             self._rests_until = min([drive.waits_until for drive in self.drives])
         else:
+            self._odd = True
             self._due = -math.inf  # it may set any timer
             for node in self._nodes:
                 node.receive(now, frame)
@@ -263,6 +297,7 @@ class DriveBus:
 
     def _stir(self) -> None:
         self._resting, self._stirred = False, True
+        self._echoes = ()
 
     def drain(self) -> list[Frame]:
         """Frames to the master, oldest first."""
@@ -279,6 +314,7 @@ class DriveBus:
     def power(self, closed: bool) -> None:
         """Close or open the arm-power chain (emergency stop). Open: the drives lose power and the brakes fall in."""
         self._put(DigitalInputs.POWER, closed)
+        self._echoes = ()
         for drive in self.drives:
             drive.powered = closed
             if not closed:

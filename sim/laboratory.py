@@ -71,6 +71,7 @@ class Laboratory(LaboratoryParty):
         self.referee = Referee(seed, truth.regime, Oracle(self._site.arm, truth, self._site.cell), now)
         self._faults = FaultPlan(np.random.default_rng((seed, _FAULTS)))
         self._noise = np.random.default_rng((seed, _NOISE))
+        self._camera: PinholeCamera | None = None
         self.bus.power(True)
         self.bus.slow_down(truth.arm_speed)
         self._moves = -1
@@ -90,9 +91,7 @@ class Laboratory(LaboratoryParty):
 
     def take_on_bus(self, now: float, frames: Sequence[Frame]) -> None:
         """Frames of the master's."""
-        receive = self.bus.receive
-        for frame in self._faults.passed(frames):
-            receive(now, frame)
+        self.bus.receive_cycle(now, self._faults.passed(frames))
 
     def take_frames(self) -> Sequence[Frame]:
         """Frames of drives and inputs since the last call."""
@@ -113,7 +112,10 @@ class Laboratory(LaboratoryParty):
 
     def camera(self) -> PinholeCamera:
         """The camera as it hangs in this regime, ready for the next image."""
-        return camera_of(self._site.cell, self.truth, self._noise)
+        if self._camera is None:
+            self._camera = camera_of(self._site.cell, self.truth, self._noise)
+        self._camera.reseed(self._noise)  # others in this process may have used it since
+        return self._camera
 
     def _picture(self, now: float) -> Picture:
         ball, cup = self.world.ball, self._cup_now()

@@ -18,8 +18,8 @@ from sim.puma_model import JOINTS, ArmModel, Link
 from sim.puma_urdf import urdf
 from sim.truth import Vector
 
-_REFRESH = ((1, 0.01), (2, 0.01), (3, 0.1), (4, 0.1))
-"""Joint and rad; the mass matrix is computed anew when a joint has moved so far: it changes by less than 1 % meanwhile. It does not
+_REFRESH = (0.01, 0.01, 0.1, 0.1)
+"""rad, of joints 2 to 5; the mass matrix is computed anew when a joint has moved so far: it changes by less than 1 % meanwhile. It does not
 depend on joint 1, and on the wrist only by its light links."""
 _STILL = 1e-4
 """rad/s; slower than this and held by friction, a joint stops."""
@@ -133,6 +133,7 @@ class ArmPlant:
         if not 0.0 < factor <= 1.0:
             raise ValueError(f"speed factor {factor}: must be above 0 and at most 1")
         self._greatest: list[float] = (self.model.speed * factor).tolist()
+        self._slowest = min(self._greatest)
 
     def step(self, dt: float, tau: Sequence[float] | None = None) -> None:
         """Move on by `dt` (s) under torques `tau` (six, N m), those in `self.tau` if None."""
@@ -145,19 +146,23 @@ class ArmPlant:
 
     def _motor_torque(self) -> list[float]:
         """What the motors give: within the torque limits, fading above the greatest speed for what would speed up."""
+        qd, slowest = self.qd, self._slowest
+        if max(qd) <= slowest and min(qd) >= -slowest:
+            return [
+                limit if tau > limit else -limit if tau < -limit else tau
+                for tau, limit in zip(self.tau, self._limit, strict=True)
+            ]
         return [
             (limit if tau > limit else -limit if tau < -limit else tau)
             if -greatest <= speed <= greatest
             else _faded(tau, limit, speed / greatest)
-            for tau, limit, speed, greatest in zip(self.tau, self._limit, self.qd, self._greatest, strict=True)
+            for tau, limit, speed, greatest in zip(self.tau, self._limit, qd, self._greatest, strict=True)
         ]
 
     def _integrate(self, dt: float, drive: list[float]) -> None:
-        q, qd, at = self.q, self.qd, self._at
-        for joint, far in _REFRESH:
-            if not -far < q[joint] - at[joint] < far:
-                self._refresh()
-                break
+        q, qd = self.q, self.qd
+        if not self._near(q):
+            self._refresh()
         self._bias = bias = self._body.bias(q, qd)
         t0, t1, t2, t3, t4, t5 = [
             u - b - c * v + f for u, b, c, v, f in zip(drive, bias, self._viscous, qd, self._friction, strict=True)
@@ -166,7 +171,7 @@ class ArmPlant:
             v + dt * (a * t0 + b * t1 + c * t2 + d * t3 + e * t4 + f * t5)
             for v, (a, b, c, d, e, f) in zip(qd, self._inverse, strict=True)
         ]
-        self._rub(dt, speed)
+        speed = self._rub(dt, speed)
         self.moves += 1
         if max(speed) < _STILL and min(speed) > -_STILL and _held(drive, bias, self._stick):
             self.still, self.qd = True, [0.0] * JOINTS
@@ -176,7 +181,13 @@ class ArmPlant:
         self.qd = speed
         self._stop_at_ends()
 
-    def _rub(self, dt: float, speed: list[float]) -> None:
+    def _near(self, q: list[float]) -> bool:
+        """Whether the mass matrix is still good enough."""
+        _, a, b, c, d, _ = self._at
+        u, v, w, x = _REFRESH
+        return -u < q[1] - a < u and -v < q[2] - b < v and -w < q[3] - c < w and -x < q[4] - d < x
+
+    def _rub(self, dt: float, speed: list[float]) -> list[float]:
         """Take dry friction off speeds: the torque that would stop the joint within the step, at most its limit.
 
         Last step's friction is the first guess (already in `speed`), so the coupling of the joints settles over a few steps.
@@ -189,13 +200,13 @@ class ArmPlant:
                 friction[joint] = wanted
                 change.append((dt * (wanted - f), self._inverse[joint]))
         for push, row in change:  # the matrix is symmetric: a row is a column
-            for joint, gain in enumerate(row):
-                speed[joint] += push * gain
+            speed = [v + push * gain for v, gain in zip(speed, row, strict=True)]
+        return speed
 
     def _stop_at_ends(self) -> None:
-        for i, (low, high) in enumerate(self._stops):
-            if not low <= self.q[i] <= high:
-                self.q[i] = min(max(self.q[i], low), high)
+        for i, (angle, (low, high)) in enumerate(zip(self.q, self._stops, strict=True)):
+            if not low <= angle <= high:
+                self.q[i] = min(max(angle, low), high)
                 self.qd[i] = 0.0
 
     def _refresh(self) -> None:

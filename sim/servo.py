@@ -39,6 +39,7 @@ class JointServo:
     def __init__(self, rating: DriveRating, q: float) -> None:
         self.rating = rating
         self._stiffness = rating.inertia * VELOCITY_GAIN
+        self._integration = self._stiffness * INTEGRAL_GAIN
         self.limit = rating.speed
         self.period = 0.004
         self.limited = False
@@ -90,13 +91,14 @@ class JointServo:
         elif not self.standing:
             self._interpolate(dt)
         self.error = error = self.reference - q
-        rating, stiffness = self.rating, self._stiffness
+        rating = self.rating
+        most = rating.torque
         wanted = self.velocity + POSITION_GAIN * error - qd
-        tau = rating.inertia * self._acceleration + stiffness * wanted + self._integral
-        if not -rating.torque < tau < rating.torque:
-            return math.copysign(rating.torque, tau)
-        if not (self.standing and -DEAD_BAND < error < DEAD_BAND):
-            self._integral += stiffness * INTEGRAL_GAIN * wanted * dt
+        tau = rating.inertia * self._acceleration + self._stiffness * wanted + self._integral
+        if not -most < tau < most:
+            return math.copysign(most, tau)
+        if not self.standing or not -DEAD_BAND < error < DEAD_BAND:
+            self._integral += self._integration * wanted * dt
         return tau
 
     @property

@@ -1,0 +1,145 @@
+"""Arm and cup as the simulated camera sees them: patches of one grey level, each the convex hull of two rims.
+
+They are worked out anew only when arm or cup has moved. Plain floats decide what is in view: most parts never are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+Box = tuple[slice, slice]
+
+ARM_GREY = 120.0
+CUP_GREY = 92.0
+CUP_INSIDE_GREY = 40.0
+CUP_WALL = 0.004
+SUBPIXEL_BITS = 4
+"""OpenCV draws polygons with corners in parts of a pixel: sixteenths."""
+_SUBPIXELS = float(1 << SUBPIXEL_BITS)
+_SOFT = 2
+"""px by which an edge drawn smooth may reach beyond its corners."""
+_STRETCH = 1.5
+"""More than the lens stretches or turns what lies around a point in view."""
+CIRCLE = np.stack([f(np.linspace(0.0, 2.0 * np.pi, 13)[:-1]) for f in (np.cos, np.sin)], axis=-1)
+_RING = np.pad(CIRCLE, ((0, 0), (0, 1)))
+
+
+class Lens(Protocol):
+    """What must be known of the camera; lengths in m, base frame."""
+
+    width: int
+    height: int
+    focal: float
+    position: Array
+
+    @property
+    def illumination(self) -> NDArray[np.float32]:
+        """Relative light (height, width)."""
+
+    def pixel(self, point: Sequence[float]) -> tuple[float, float, float]:
+        """Pixel (u, v) of a point (3,), and its depth before the lens (m)."""
+
+    def project(self, points: Array) -> Array:
+        """Pixels (..., 2) of points (..., 3)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Cover:
+    """What arm or cup hide: a convex hull (n, 1, 2) in sixteenths of a pixel, the box of the image that holds it, its grey
+    level, its height (m)."""
+
+    hull: NDArray[np.int32]
+    box: Box
+    grey: float
+    height: float
+    cup: bool
+
+
+class Occluders:
+    """Keeps the covers of the newest pose of arm and cup."""
+
+    def __init__(self, lens: Lens, cup_radius: float, cup_depth: float) -> None:
+        """Radius and depth of the cup (m)."""
+        self._lens = lens
+        outer = _RING * (cup_radius + CUP_WALL)
+        self._rings: Array = np.concatenate([outer, outer - (0.0, 0.0, cup_depth), _RING * cup_radius])
+        self._size = math.hypot(cup_radius + CUP_WALL, cup_depth)
+        self._seen: tuple[bytes, list[Cover]] = (b"", [])
+
+    def covers(self, points: Array, radii: Array, pose: Array | None) -> list[Cover]:
+        """What hides something now: capsules of the arm (points (n, 2, 3), radii (n,)), cup at `pose` (4, 4) if not None."""
+        key = points.tobytes() + radii.tobytes() + (b"" if pose is None else pose.tobytes())
+        if key != self._seen[0]:
+            if len(points) != len(radii):
+                raise ValueError(f"{len(points)} capsules of the arm, but {len(radii)} radii")
+            arm = [self._capsule(a, b, r) for (a, b), r in zip(points.tolist(), radii.tolist(), strict=True)]
+            self._seen = key, [cover for cover in arm if cover is not None] + self._cup(pose)
+        return self._seen[1]
+
+    def _capsule(self, a: Sequence[float], b: Sequence[float], radius: float) -> Cover | None:
+        """The hull of both ends' discs, None if it is not in view."""
+        lens = self._lens
+        (ua, va, near), (ub, vb, far) = lens.pixel(a), lens.pixel(b)
+        if near <= 4.0 * radius or far <= 4.0 * radius:
+            return None  # at or behind the lens: out of focus anyway
+        ra, rb = radius * lens.focal / near, radius * lens.focal / far
+        if not self._in_view(
+            min(ua - ra, ub - rb), min(va - ra, vb - rb), max(ua + ra, ub + rb), max(va + ra, vb + rb)
+        ):
+            return None
+        rims = np.concatenate([ra * CIRCLE + (ua, va), rb * CIRCLE + (ub, vb)])
+        return self._cover(rims, ARM_GREY, 0.5 * (a[2] + b[2]))
+
+    def _cup(self, pose: Array | None) -> list[Cover]:
+        """The wall as the hull of both rims, then the dark mouth as far as it faces the camera."""
+        if pose is None:
+            return []
+        lens, mouth = self._lens, pose[:3, 3].tolist()
+        u, v, depth = lens.pixel(mouth)
+        if depth - self._size < 0.1:
+            return []
+        reach = _STRETCH * self._size * lens.focal / (depth - self._size)
+        if not self._in_view(u - reach, v - reach, u + reach, v + reach):
+            return []
+        pixels, count = lens.project(self._rings @ pose[:3, :3].T + pose[:3, 3]), 2 * len(_RING)
+        wall = pixels[:count]
+        if not self._in_view(*wall.min(axis=0).tolist(), *wall.max(axis=0).tolist()):
+            return []
+        covers = [self._cover(wall, CUP_GREY, mouth[2], cup=True)]
+        if (lens.position - pose[:3, 3]) @ pose[:3, 2] > 0.0:
+            covers.append(self._cover(pixels[count:], CUP_INSIDE_GREY, mouth[2], cup=True))
+        return covers
+
+    def _in_view(self, left: float, top: float, right: float, bottom: float) -> bool:
+        """Whether some of a box (px) is in the image."""
+        return right >= 0.0 and bottom >= 0.0 and left < self._lens.width and top < self._lens.height
+
+    def _cover(self, pixels: Array, grey: float, height: float, cup: bool = False) -> Cover:
+        """The convex hull of pixels in its middle's light."""
+        lens = self._lens
+        u, v = (pixels.sum(axis=0) / len(pixels)).tolist()
+        light = lens.illumination[min(max(int(v), 0), lens.height - 1), min(max(int(u), 0), lens.width - 1)]
+        hull = np.asarray(cv2.convexHull(np.rint(pixels * _SUBPIXELS).astype(np.int32)), np.int32)
+        left, top, wide, high = cv2.boundingRect(hull)
+        box = _within(lens.height, top, top + high), _within(lens.width, left, left + wide)
+        return Cover(hull, box, grey * float(light), height, cup)
+
+
+def _within(size: int, low: int, high: int) -> slice:
+    """Whole pixels of an image side of `size` px around a stretch in sixteenths of a pixel."""
+    return slice(max((low >> SUBPIXEL_BITS) - _SOFT, 0), min((high >> SUBPIXEL_BITS) + _SOFT + 1, size))
+
+
+def fill(picture: Picture, covers: Sequence[Cover]) -> None:
+    """Draw covers with smooth edges."""
+    for cover in covers:
+        cv2.fillConvexPoly(picture, cover.hull, cover.grey, cv2.LINE_AA, SUBPIXEL_BITS)
