@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Stop, or clear; 0 when every node with devices has answered, 3 otherwise."""
     from coordinator.emergency import CLEAR, STOP, order_all
-    from coordinator.realtime import credentials_of
+    from services.comm.credentials import COORDINATOR, credentials
     from services.comm.security import KeyFileError
 
     door = _door(options)
@@ -53,7 +53,7 @@ def run(options: argparse.Namespace) -> int:
     verb = CLEAR if options.clear else STOP
     begun = time.perf_counter()
     try:
-        answers = asyncio.run(order_all(directory, credentials_of(directory), verb, bus=options.bus))
+        answers = asyncio.run(order_all(directory, credentials(directory, COORDINATOR), verb, bus=options.bus))
     except KeyFileError as fault:
         raise CommandError(2, str(fault)) from fault
     took = time.perf_counter() - begun

@@ -1,38 +1,89 @@
-"""Make the shared key that nodes on several hosts need, and say where to copy it."""
+"""Make what several hosts need to trust each other: one shared key, or certificates (--tls); and say where to copy it."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from coordinator.cli import CommandError
-from coordinator.cli.loading import add_services_argument, load_directory, services_path
+from coordinator.cli.loading import add_services_argument, load_directory
 
-EXAMPLE = "petrobot keys --file cell.key"
+if TYPE_CHECKING:
+    from services.comm.directory import Directory
+
+EXAMPLE = "petrobot keys --tls"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument(
-        "--file", type=Path, default=Path("cell.key"), help="the key file to write (default: %(default)s)"
+        "--file", type=Path, default=Path("cell.key"), help="the shared key file to write (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--tls",
+        type=Path,
+        metavar="FOLDER",
+        nargs="?",
+        const=Path("keys"),
+        help="make certificates for mutual TLS in this folder (%(const)s) instead: they also keep others from reading",
     )
     add_services_argument(parser)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write the key; an existing one is never overwritten."""
+    """Write the key or the certificates; what exists is never overwritten."""
+    directory = load_directory(options.services)
+    print(_certificates(directory, options.tls) if options.tls is not None else _shared_key(directory, options.file))
+    return 0
+
+
+def _shared_key(directory: Directory, file: Path) -> str:
     from services.comm.security import KeyFileError, new_key, write_key
 
-    directory = load_directory(options.services)
     try:
-        write_key(options.file, new_key())
+        write_key(file, new_key())
     except KeyFileError as fault:
         raise CommandError(2, str(fault)) from fault
     hosts = ", ".join(sorted({node.host for node in directory.nodes.values()}))
-    print(
-        f"wrote {options.file}: readable by you alone, never printed, never logged\n"
-        f"1. copy it beside services.toml on every host ({hosts}), for example: scp -p {options.file} HOST:FOLDER/\n"
-        f"2. name it in {services_path(options.services)}, the same on every host:\n"
-        f'   [keys]\n   file = "{options.file.name}"'
+    return (
+        f"wrote {file}: readable by you alone, never printed, never logged\n"
+        f"1. copy it beside services.toml on every host ({hosts}), for example: scp -p {file} HOST:FOLDER/\n"
+        f"2. name it in {directory.source}, the same on every host:\n"
+        f'   [keys]\n   file = "{file.name}"'
     )
-    return 0
+
+
+def _certificates(directory: Directory, folder: Path) -> str:
+    try:
+        from coordinator.certificates import CA_KEY, CertificateError, make_certificates
+    except ImportError as fault:
+        text = f"making certificates needs the package cryptography: pip install 'petrobot[tls]' ({fault})"
+        raise CommandError(2, text) from fault
+    from services.comm.credentials import CA_FILE, COORDINATOR
+
+    try:
+        written = make_certificates(folder, [COORDINATOR, *directory.nodes])
+    except CertificateError as fault:
+        raise CommandError(2, str(fault)) from fault
+    by_host: dict[str, list[str]] = {}
+    for node in directory.nodes.values():
+        by_host.setdefault(node.host, []).append(node.name)
+    copies = [
+        f"   {host}: {', '.join([CA_FILE, *(f'{name}.pem, {name}.key' for name in names)])}"
+        for host, names in sorted(by_host.items())
+    ]
+    return "\n".join(
+        [
+            f"wrote {', '.join(written)} in {folder}"
+            if written
+            else f"{folder} has a certificate for every node already",
+            f"1. copy into a folder {folder.name}/ beside services.toml (scp -p keeps keys unreadable for others), on",
+            *copies,
+            f"   the coordinator's host, and wherever `petrobot estop` is to work: {CA_FILE}, {COORDINATOR}.pem, "
+            f"{COORDINATOR}.key",
+            f"2. keep {CA_KEY} here alone: who has it can make certificates; it is needed only when a node is added",
+            f"3. name the folder in {directory.source}, the same on every host:",
+            f'   [keys]\n   certificates = "{folder.name}"',
+        ]
+    )

@@ -1,0 +1,149 @@
+"""The emergency stop on real processes: coordinator or node stopped in mid-move, and still the drives stop, seen on their bus."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from coordinator.door_file import find_door
+from coordinator.launch import local_programs
+from coordinator.runfolder import NoRunError
+from coordinator.supervisor import Supervisor
+from services.comm.canopen import NmtState
+from services.comm.cia402 import State
+from services.comm.directory import Directory
+from tests.doors.arm_cell import DRIVES, ROOT, Ear, cell_in, ear_on
+
+pytestmark = pytest.mark.processes
+LIMIT = 60.0
+RAMP = 1.0
+"""Seconds in which a drive's quick stop and its brake are over."""
+
+
+def petrobot(*arguments: str) -> subprocess.Popen[str]:
+    """A command in a process of its own."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.Popen(
+        [sys.executable, "-m", "coordinator", *arguments],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+async def finished(process: subprocess.Popen[str]) -> tuple[int, str, str]:
+    """Its exit code and what it printed."""
+    out, err = await asyncio.to_thread(process.communicate, None, LIMIT)
+    return process.returncode, out, err
+
+
+class Cell:
+    """The launched nodes, an ear on the bus, and a coordinator that moves the arm."""
+
+    def __init__(self, folder: Path, directory: Directory, supervisor: Supervisor, ear: Ear) -> None:
+        self.folder = folder
+        self.directory = directory
+        self.supervisor = supervisor
+        self.ear = ear
+        self.runs = folder / "runs"
+        self.coordinator: subprocess.Popen[str] | None = None
+
+    async def heard(self, holds: Callable[[Ear], bool]) -> None:
+        """Wait until what is heard on the bus fits."""
+        await asyncio.to_thread(self.ear.until, holds, LIMIT)
+
+    async def sweep(self) -> None:
+        """Let a coordinator move the arm, until it really moves."""
+        await self.heard(lambda ear: len(ear.positions) == len(DRIVES))
+        self.ear.forget()
+        services = ["--services", str(self.directory.source), "--journal", str(self.runs)]
+        self.coordinator = petrobot("run", str(self.folder / "sweeping.toml"), *services, "--no-page", "--quiet")
+        await self.heard(Ear.moving)
+
+    async def estop(self, *options: str) -> tuple[int, Any]:
+        """`petrobot estop`; its exit code and answers."""
+        services = ["--services", str(self.directory.source), "--journal", str(self.runs)]
+        code, out, err = await finished(petrobot("estop", *services, "--json", "-", *options))
+        assert out, err
+        return code, json.loads(out)
+
+    async def standing(self) -> None:
+        """Wait until the joints are where they were a ramp ago: whatever moved them is over."""
+        while True:
+            before = dict(self.ear.positions)
+            await asyncio.to_thread(threading.Event().wait, RAMP / 4)
+            if all(abs(self.ear.positions[n] - before[n]) < 200 for n in DRIVES):
+                return
+
+
+@asynccontextmanager
+async def cell_of(folder: Path) -> AsyncIterator[Cell]:
+    """Laboratory and motion node as processes."""
+    directory = cell_in(folder)
+    async with Supervisor(local_programs(directory), folder / "logs", respawn=False) as supervisor:
+        with ear_on(directory) as ear:
+            cell = Cell(folder, directory, supervisor, ear)
+            try:
+                yield cell
+            finally:
+                if cell.coordinator is not None:
+                    cell.coordinator.kill()
+                    cell.coordinator.communicate()
+                for pid in supervisor.process_ids().values():
+                    os.kill(pid, signal.SIGCONT)
+
+
+async def test_estop_stops_the_drives_though_the_coordinator_is_frozen(tmp_path: Path) -> None:
+    """SIGSTOP in mid-move: quick stop on the bus, drives brake, and nothing moves them before it is cleared."""
+    async with cell_of(tmp_path) as cell:
+        await cell.sweep()
+        assert cell.coordinator is not None
+        cell.coordinator.send_signal(signal.SIGSTOP)
+        code, told = await cell.estop()
+        (node,) = told["nodes"]
+        assert (code, node["node"], set(node["devices"])) == (0, "motion", {"arm"})
+        assert told["coordinator"].endswith("the coordinator does not answer")
+        await cell.heard(lambda ear: ear.quick_stop_at is not None)
+        await cell.heard(lambda ear: ear.all_in(State.SWITCH_ON_DISABLED))
+        await cell.standing()
+        cell.coordinator.send_signal(signal.SIGCONT)
+        code, _, _ = await finished(cell.coordinator)
+        assert code == 1, "the task's own recovery must not have moved the arm"
+        assert cell.ear.all_in(State.SWITCH_ON_DISABLED)
+        assert (await cell.estop("--clear"))[0] == 0
+        assert cell.ear.all_in(State.SWITCH_ON_DISABLED), "clearing alone moves and enables nothing"
+        await cell.sweep()  # by way of the task's error branch: drives are reset by an action, not by themselves
+
+
+async def test_estop_reaches_the_bus_though_the_node_is_frozen(tmp_path: Path) -> None:
+    """The node does not answer: all devices of its bus are stopped by NMT, and its absence is said."""
+    async with cell_of(tmp_path) as cell:
+        await cell.sweep()
+        os.kill(cell.supervisor.process_ids()["motion"], signal.SIGSTOP)
+        code, told = await cell.estop()
+        (node,) = told["nodes"]
+        assert code == 3 and node["seconds"] is None
+        assert node["bus"].endswith("all devices stopped by NMT")
+        await cell.heard(lambda ear: [ear.nmt.get(n) for n in DRIVES] == [NmtState.STOPPED] * len(DRIVES))
+
+
+async def test_estop_without_nodes_says_so(tmp_path: Path) -> None:
+    """Nobody is there: exit code 3, and the one who asked knows that nothing was stopped."""
+    directory = cell_in(tmp_path)
+    services = ["--services", str(directory.source), "--journal", str(tmp_path)]
+    code, out, _ = await finished(petrobot("estop", *services))
+    assert code == 3 and "NO ANSWER" in out and "no CAN hub" in out
+    with pytest.raises(NoRunError):
+        find_door(folder=tmp_path)
