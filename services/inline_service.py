@@ -11,6 +11,7 @@ from services.callables import check_arguments, describe
 from services.comm.callee import Inline
 from services.comm.directory import ServiceEntry, resolve
 from services.comm.messages import Call, Executed, Outcome
+from services.comm.plain import NotPlainError, plain
 from services.context import RunContext
 from services.outlets import Outlets
 from services.runs import Begin, Raised, Report
@@ -44,7 +45,11 @@ def inline_service(service: ServiceEntry, raised: EventSink) -> Inline:
         if not isinstance(result, Result):
             text = f"returned a {type(result).__name__}; return success(), failure() or error()"
             return Outcome(call.id, Status.ERROR, {}, "bad_result", text)
+        try:
+            values = plain(result.values, "values")
+        except NotPlainError as fault:
+            return Outcome(call.id, Status.ERROR, {}, "bad_result", f"what it returned cannot be sent: {fault}")
         cpu = time.process_time() - before
-        return Outcome(call.id, result.status, result.values, result.cause, result.text, cpu_seconds=cpu)
+        return Outcome(call.id, result.status, values, result.cause, result.text, cpu_seconds=cpu)
 
     return answer

@@ -162,7 +162,7 @@ class Callee:
     def answer_inline(self, now: float, peer: str, call: Call) -> Outcome | None:
         """The outcome of a call to a service that is answered on the spot, None if it is another kind of call.
 
-        As `receive`, but the answer does not go through `messages`: the shortest way for a shell that has only this call.
+        As `receive`, but the answer does not go through `messages`: the shell sends it, then has it kept by `keep`.
         """
         offer = self.offers.get(call.service)
         id_ = call.id
@@ -172,9 +172,14 @@ class Callee:
             return None
         if self._peers.refusal_of_call(now, peer, call, offer, self._in_use) is not None:
             return None
-        outcome = self._answered(now, offer.inline, call)
+        return self._answered(now, offer.inline, call)
+
+    def keep(self, now: float, peer: str, outcome: Outcome) -> None:
+        """What `answer_inline` gave is on its way: keep it until it is acknowledged, as every result."""
         self._results.add(now, peer, outcome)
-        return outcome
+        due = now + self._keeping.results
+        if due < self.soonest:
+            self.soonest = due
 
     @property
     def has_work(self) -> bool:

@@ -318,6 +318,11 @@ class Caller:
         return len(self._pending)
 
     @property
+    def waiting(self) -> int:
+        """How many messages wait to be taken out."""
+        return len(self._messages)
+
+    @property
     def has_news(self) -> bool:
         """Whether there are notices to take out."""
         return bool(self._notices)

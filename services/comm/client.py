@@ -23,6 +23,8 @@ from services.comm.wire import ProtocolError, Side, State
 
 OnNotices = Callable[[float, list[Notice]], None]
 _NO_ARGUMENTS: Mapping[str, Any] = {}
+AT_ONCE = 16
+"""Calls that share one write: the peer takes them in while the next ones are made."""
 
 
 class _ClientLink(Link):
@@ -40,15 +42,18 @@ class _ClientLink(Link):
 
     def took(self, now: float, messages: list[Message]) -> None:
         client = self._client
+        receive = client.caller.receive
         for message in messages:
-            if isinstance(message, Welcome):
+            if type(message) is Outcome:
+                receive(now, message)
+            elif isinstance(message, Welcome):
                 self.welcome = True
                 self.opened()
                 client.welcomed(now, self, message)
             elif isinstance(message, Refuse):
                 self.refusal = message
             elif not isinstance(message, Bye):
-                client.caller.receive(now, message)
+                receive(now, message)
         client.flush(now)
 
     def unsendable(self, message: Message, fault: ProtocolError) -> Message | None:
@@ -170,10 +175,10 @@ class Client:
         future.asked = self, id_
         caller = self.caller
         caller.begin(now, id_, service, arguments, deadline, parent, seed, done=future.end)
-        if caller.calls == 1:
+        if caller.calls == 1 or caller.waiting >= AT_ONCE:
             self.flush(now)
         elif not self._flushing:
-            # Others are under way: let those that are made in this turn of the loop share one write.
+            # Others are under way: let those that are made in this turn of the loop share a write.
             self._flushing = True
             self._loop.call_soon(self._flush_soon)
         return future

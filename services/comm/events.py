@@ -35,6 +35,8 @@ class EventBoard:
         self._listeners: dict[str, _Listener] = {}
         self._kept: dict[str, deque[_Kept]] = {}
         self._numbers: dict[str, int] = {}
+        self._runs: set[str] = set()
+        """Runs that have raised latched events."""
         self.lost = 0
         """Latched events that gave way to newer ones before anybody had them."""
 
@@ -64,6 +66,8 @@ class EventBoard:
             kept.popleft()
             self.lost += 1
         kept.append(_Kept(event, owner))
+        if event.run:
+            self._runs.add(event.run)
         return event
 
     def acknowledge(self, peer: str, source: str, number: int) -> None:
@@ -87,6 +91,9 @@ class EventBoard:
 
     def forget_run(self, run: str) -> None:
         """A run is over and acknowledged: its events are gone with it."""
+        if run not in self._runs:
+            return
+        self._runs.discard(run)
         for source, kept in self._kept.items():
             if any(one.event.run == run for one in kept):
                 self._kept[source] = deque(one for one in kept if one.event.run != run)

@@ -58,11 +58,17 @@ def _plain(value: Any, where: str, depth: int) -> Any:
 
 
 def _plain_dict(value: Mapping[Any, Any], where: str, depth: int) -> dict[str, Any]:
-    copy = {}
+    copy: dict[str, Any] = {}
     for key, item in value.items():
         if type(key) is not str:
             raise NotPlainError(f"{where}: the key {key!r} is not a str")
-        copy[key] = item if type(item) in _SIMPLE else _plain(item, f"{where}.{key}", depth - 1)
+        kind = type(item)
+        if kind in _SIMPLE:
+            copy[key] = item
+        elif kind is list and depth > 1 and _SIMPLE.issuperset(map(type, item)):
+            copy[key] = list(item)  # as below, without naming the place
+        else:
+            copy[key] = _plain(item, f"{where}.{key}", depth - 1)
     return copy
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -34,6 +35,8 @@ class ResultStore:
         # A plain dict is slow to find its first entry once many were deleted before it.
         self._results: OrderedDict[str, tuple[Outcome, str, float]] = OrderedDict()
         self._ids: OrderedDict[str, float] = OrderedDict()
+        self._ids_due = math.inf
+        """Not later than when the oldest id has been remembered long enough (s)."""
 
     def __contains__(self, id_: str) -> bool:
         return id_ in self._ids or id_ in self._results
@@ -78,9 +81,18 @@ class ResultStore:
     def _forget(self, now: float, id_: str) -> None:
         del self._results[id_]
         self._ids[id_] = now
+        if now >= self._ids_due or len(self._ids) > self._keeping.id_count:
+            self._forget_ids(now)
+        elif len(self._ids) == 1:
+            self._ids_due = now + self._keeping.ids
+        self._forgotten(id_)
+
+    def _forget_ids(self, now: float) -> None:
+        self._ids_due = math.inf
         while self._ids:
             oldest = next(iter(self._ids))
-            if len(self._ids) <= self._keeping.id_count and self._ids[oldest] + self._keeping.ids > now:
+            due = self._ids[oldest] + self._keeping.ids
+            if len(self._ids) <= self._keeping.id_count and due > now:
+                self._ids_due = due
                 break
             del self._ids[oldest]
-        self._forgotten(id_)

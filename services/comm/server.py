@@ -25,6 +25,8 @@ from services.comm.tls_listener import TlsListener
 from services.comm.wire import ProtocolError, Side, State
 
 OnOrders = Callable[[float, list[Order]], None]
+AT_ONCE = 16
+"""Answers that share one write: the caller takes them in while the next ones are made."""
 COUNTED = 256
 """Messages of a caller after which its rate is looked at."""
 
@@ -51,21 +53,29 @@ class _ServerLink(Link):
         self._taken += len(messages)
         if self._taken >= COUNTED and not self._in_time(now):
             return
-        if peer and len(messages) == 1 and type(messages[0]) is Call:
-            outcome = callee.answer_inline(now, peer, messages[0])
-            if outcome is not None:
-                # The shortest way for what is answered on the spot.
-                self.send_one(outcome)
-                if callee.has_work:
-                    self._server.flush(now)
-                return
+        answers: list[Message] = []
         for message in messages:
-            if isinstance(message, Hello):
+            if type(message) is Call and peer and (answer := callee.answer_inline(now, peer, message)) is not None:
+                # The shortest way for what is answered on the spot; the caller reads while its answer is being kept here.
+                if len(messages) == 1:
+                    self.send_one(answer)
+                else:
+                    answers.append(answer)
+                    if len(answers) == AT_ONCE:
+                        self.send(answers)
+                        answers = []
+                callee.keep(now, peer, answer)
+            elif isinstance(message, Hello):
                 self._greet(now, message)
                 peer = self.peer
             elif peer:
                 callee.receive(now, peer, message)
-        self._server.flush(now)
+        if answers:
+            self.send(answers)
+        if callee.has_work:
+            self._server.flush(now)
+        else:
+            self._server.arm()
 
     def _in_time(self, now: float) -> bool:
         """Read no more for a while from one that sends faster than it may; False: it is too much, and it must go."""
@@ -224,14 +234,15 @@ class Server:
                 by_peer.setdefault(peer, []).append(message)
             for peer, its in by_peer.items():
                 self._send(peer, its)
-        self._arm()
+        self.arm()
 
     def _send(self, peer: str, messages: list[Message]) -> None:
         link = self._links.get(peer)
         if link is not None:
             link.send(messages)
 
-    def _arm(self) -> None:
+    def arm(self) -> None:
+        """Have the callee's `advance` called when it is due."""
         if self._timer is not None and self._timer.when() <= self.callee.soonest:
             return
         due = self.callee.due()

@@ -317,6 +317,8 @@ def test_a_service_answered_on_the_spot_is_answered_once_by_either_way() -> None
     callee = _callee()
     outcome = callee.answer_inline(1.0, "coord", m.Call("1", "get", epoch=3))
     assert outcome == m.Outcome("1", "success", {"at": 1.0}) and not callee.has_work
+    callee.keep(1.0, "coord", outcome)
+    assert callee.soonest == 1.0 + Keeping().results, "it is not kept for ever"
     for call in (m.Call("1", "get", epoch=3), m.Call("2", "track", epoch=3), m.Call("3", "nowhere", epoch=3)):
         assert callee.answer_inline(2.0, "coord", call) is None
     assert callee.answer_inline(2.0, "coord", m.Call("4", "get", epoch=3, boot="n0")) is None
