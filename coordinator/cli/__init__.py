@@ -7,7 +7,6 @@ import importlib
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 
 EXIT_CODES = """\
 exit codes: 0 the task reached its final marking (or the command did its work), 1 it ended in ERROR or was aborted,
@@ -69,6 +68,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; gives the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments[:1] == ["--version"]:
+        from importlib.metadata import version  # takes longer to import than all else here
+
         print(f"petrobot {version('petrobot')}")
         return 0
     known = {command.name: command for command in COMMANDS}
