@@ -50,6 +50,7 @@ LIMITS: Mapping[int, int] = {
 MAX_CONTAINERS = 100_000
 """Most arrays and maps in one message: one byte each on the wire, some 70 in memory."""
 _UNCOUNTED = 64 * KIB
+_NUMBERS = frozenset((float, int))
 _ARRAY, _MESSAGE = 1, 2
 """msgpack extension types inside Tick: an array of numbers, a message."""
 
@@ -105,9 +106,8 @@ def _names(value: list[Any]) -> tuple[str, ...]:
 
 
 def _numbers(value: list[Any]) -> tuple[float, ...]:
-    for item in value:
-        if type(item) not in (float, int) or not math.isfinite(item):
-            raise _FieldError("not an array of finite numbers")
+    if not _NUMBERS.issuperset(map(type, value)) or not all(map(math.isfinite, value)):
+        raise _FieldError("not an array of finite numbers")
     return tuple(map(float, value))
 
 

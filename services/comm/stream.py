@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import math
 import secrets
+import select
 import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -35,6 +36,10 @@ from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION, ProtocolError, Si
 __all__ = ["STALE_AFTER", "Incoming", "Inlet", "Sink", "StreamReceiver", "StreamSender"]
 
 _CONNECTIONS: Final = 16
+_ADMITTED: Final = 4
+"""Connections taken in a poll, and"""
+_STRANGERS_CHUNK: Final = 2048
+"""bytes read in a poll from one that has not opened a stream: strangers must not hold up the servo loop that polls."""
 _HANDSHAKE: Final = 2.0
 _RETRY: Final = 0.1
 
@@ -80,14 +85,17 @@ class StreamSender:
 
     def send(self, values: Sequence[float], held: float = 0.0) -> bool:
         """Send the newest values, which the sender has stood by for `held` seconds. False if they were dropped."""
-        line = self.advance()
+        line = self._line if self.up else self.advance()
+        if line is not None and line.unsent:
+            line = self.advance()
         if line is None or line.unsent:
             self.dropped += 1
             return False
         self._number += 1
         elapsed = self._clock() - self._opened
-        point = SetPoint(self._number, tuple(map(float, values)), held, elapsed)
-        return self._write(line, point)
+        sent = self._write(line, SetPoint(self._number, tuple(map(float, values)), held, elapsed))
+        self.advance()  # what the receiver said can wait until the value is on its way
+        return sent
 
     def withdraw(self) -> None:
         """Stand by the last values no more."""
@@ -176,7 +184,7 @@ class StreamSender:
         self._again = again
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class _Guest:
     line: Line
     since: float
@@ -208,9 +216,12 @@ class StreamReceiver:
         self._streams = streams
         self._key = key
         self._clock = clock
-        self._guests: list[_Guest] = []
+        self._guests: dict[int, _Guest] = {}
+        """By the number of their sockets."""
+        self._ready = select.epoll()
         self._listener = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
         self._listener.setblocking(False)
+        self._ready.register(self._listener, select.EPOLLIN)
 
     @property
     def address(self) -> tuple[str, int]:
@@ -220,34 +231,49 @@ class StreamReceiver:
 
     def sockets(self) -> list[socket.socket]:
         """What to wait on, for a loop that would rather wait than poll each cycle."""
-        return [self._listener, *(guest.line.sock for guest in self._guests)]
+        return [self._listener, *(guest.line.sock for guest in self._guests.values())]
 
     def poll(self) -> None:
         """Take in all that has arrived; never blocks."""
+        # Asked for first: a read of each socket in vain is an exception each, and this is called in every servo cycle.
+        ready = {number for number, _ in self._ready.poll(0.0)}
         now = self._clock()
-        self._admit(now)
-        for guest in list(self._guests):
-            self._serve(now, guest)
+        for number, guest in list(self._guests.items()):
+            if number in ready or guest.line.unsent:
+                self._serve(now, guest)
+            else:
+                self._wait(now, guest)
+        if self._listener.fileno() in ready:
+            self._admit(now)
 
     def close(self) -> None:
         """Listen no more and end all streams."""
-        self._listener.close()
-        for guest in list(self._guests):
+        for guest in list(self._guests.values()):
             self._end(guest)
+        self._ready.close()
+        self._listener.close()
 
     def _admit(self, now: float) -> None:
         with contextlib.suppress(OSError):
-            while True:
+            for _ in range(_ADMITTED):
                 sock, _ = self._listener.accept()
                 line = Line(sock, Side.SERVER, self._key)
                 line.tune()
-                self._guests.append(_Guest(line, now))
+                self._ready.register(sock, select.EPOLLIN)
+                newest = self._guests[sock.fileno()] = _Guest(line, now)
                 if len(self._guests) > _CONNECTIONS:
-                    self._end(next((one for one in self._guests if one.inlet is None), self._guests[-1]))
+                    self._end(next((one for one in self._guests.values() if one.inlet is None), newest))
+
+    def _wait(self, now: float, guest: _Guest) -> None:
+        """Nothing came: what is there grows older."""
+        if guest.inlet is not None:
+            guest.inlet.receive(now, ())
+        elif now > guest.since + _HANDSHAKE:
+            self._end(guest)
 
     def _serve(self, now: float, guest: _Guest) -> None:
         try:
-            messages = guest.line.read()
+            messages = guest.line.read() if guest.inlet is not None else guest.line.read(1, _STRANGERS_CHUNK)
             guest.line.write(b"")
         except ProtocolError as fault:
             if guest.inlet is not None:
@@ -298,7 +324,7 @@ class StreamReceiver:
 
     def _replace(self, guest: _Guest, stream: str) -> None:
         """A stream has one sender: the newest."""
-        for older in [one for one in self._guests if one.stream == stream]:
+        for older in [one for one in self._guests.values() if one.stream == stream]:
             self._end(older)
         incoming = self._streams[stream]
         guest.stream, guest.inlet = stream, Inlet(incoming.period, incoming.sink)
@@ -314,8 +340,9 @@ class StreamReceiver:
         self._end(guest)
 
     def _end(self, guest: _Guest) -> None:
-        if guest in self._guests:
-            self._guests.remove(guest)
-            guest.line.sock.close()
+        number = guest.line.sock.fileno()
+        if self._guests.get(number) is guest:
+            del self._guests[number]
+            guest.line.sock.close()  # and with it epoll lets it go
             if guest.inlet is not None:
                 self._streams[guest.stream].sink.withdraw()

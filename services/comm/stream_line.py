@@ -123,12 +123,13 @@ class Line:
             sent = 0
         self.unsent = data[sent:]
 
-    def read(self) -> list[Message]:
-        """Messages that have arrived. Raises OSError when the connection is gone, ProtocolError when it is no good."""
+    def read(self, reads: int = _READS, chunk: int = _CHUNK) -> list[Message]:
+        """Messages that have arrived, of at most so many reads. Raises OSError when the connection is gone, ProtocolError
+        when it is no good."""
         messages: list[Message] = []
-        for _ in range(_READS):
+        for _ in range(reads):
             try:
-                data = self.sock.recv(_CHUNK)
+                data = self.sock.recv(chunk)
             except BlockingIOError:
                 break
             if not data:
@@ -136,6 +137,6 @@ class Line:
             messages += self.connection.receive_data(data)
             if out := self.connection.data_to_send():
                 self.write(out)
-            if len(data) < _CHUNK:
+            if len(data) < chunk:
                 break
         return messages

@@ -215,7 +215,7 @@ def test_malformed_set_points_end_their_connection_alone(
 
 
 def _is_served(receiver: StreamReceiver) -> bool:
-    return any(guest.line.connection.version for guest in receiver._guests)
+    return any(guest.line.connection.version for guest in receiver._guests.values())
 
 
 @pytest.mark.parametrize("key", [None], indirect=True, ids=["plain"])
