@@ -19,6 +19,11 @@ SLOT: Final = 0.02
 _DRAWN: Final = 256
 """Slips drawn at a time."""
 
+_CAUGHT_UP: Final = 1e-6
+"""rad/s off its set point at which a wheel has caught up."""
+_STUCK: Final = 0.01
+"""rad/s below which a wheel that is to stand sticks by dry friction: 1 mm/s."""
+
 
 class Wheel:
     """One wheel: its speed follows the set point with a lag, or its brake holds it."""
@@ -43,7 +48,8 @@ class Wheel:
             rest = math.exp(-dt / lag)
             turned = target * dt + excess * lag * (1.0 - rest)
             self.speed = target + excess * rest
-            if -1e-6 < self.speed - target < 1e-6:
+            near = _STUCK if target == 0.0 else _CAUGHT_UP
+            if -near < self.speed - target < near:
                 self.speed = target
         self.angle += turned
         return turned

@@ -137,7 +137,7 @@ class RoverBus:
         self.sensor = sensor
         self._nodes: tuple[CanopenNode, ...] = (*self.drives, sensor)
         self._own = {node.node: node for node in self._nodes}
-        self._due = -math.inf
+        self._due, self._watch_due = -math.inf, now
         for node in self._nodes:
             node.boot(now)
 
@@ -160,14 +160,14 @@ class RoverBus:
         """What rover and devices do on time."""
         if now < self._due - 1e-9:
             return
-        slot = self.rover.due() <= now + 1e-9
         self.rover.move_to(now)
-        if slot:
+        if now >= self._watch_due - 1e-9:
+            self._watch_due = max(self._watch_due, now - SLOT) + SLOT
             for drive in self.drives:
                 drive.step(now)
         for node in self._nodes:
             node.advance(now)
-        self._due = min(self.rover.due(), *(node.due() for node in self._nodes))
+        self._due = min(self._watch_due, *[node.due() for node in self._nodes])
 
     def drain(self) -> list[Frame]:
         """Frames to the master, oldest first."""

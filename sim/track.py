@@ -203,14 +203,14 @@ class Track:
         """Colour of the floor at points (...,), m: 0 black, 1 white."""
         x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
         i, j = np.floor(x / SQUARE).astype(int), np.floor(y / SQUARE).astype(int)
-        colour: NDArray[np.uint8] = ((i + j) % 2 == 0).astype(np.uint8)
+        marked = np.zeros(x.shape, bool)
         for number, element in enumerate(self.elements):
             inside = (i == element.square[0]) & (j == element.square[1])
             if element.painted and inside.any():
                 last = number == len(self.elements) - 1
                 depth = element.tee_depth(x, y) if last else element.depth(x, y)
-                colour[inside & (depth >= 0.0)] ^= 1
-        return colour
+                marked |= inside & (depth >= 0.0)
+        return np.asarray(((i + j) % 2 == 0) ^ marked, np.uint8)
 
 
 # Drawing a track at random

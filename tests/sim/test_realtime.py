@@ -26,6 +26,7 @@ from services.comm.directory import load
 from services.comm.lockstep import Member
 from services.comm.messages import Call, Hello, Outcome
 from services.comm.party import TICK, Envelope
+from sim.laboratory import Laboratory
 from sim.realtime import LaboratoryShell, bus_channel, camera_address
 from sim.truth import LaboratoryError
 
@@ -132,6 +133,7 @@ async def test_drives_answer_on_the_bus(shell: LaboratoryShell, cell_master: Cal
         return bool(master.enabled)
 
     await until(exchange)
+    assert isinstance(lab, Laboratory)
     assert master.position == pytest.approx(lab.plant.q, abs=1e-3)
     port.close()
 

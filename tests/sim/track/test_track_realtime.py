@@ -1,0 +1,187 @@
+"""The rover's laboratory on the wall clock: the shell that every laboratory has, and `python -m sim` as a process."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from services.comm.caller import Caller
+from services.comm.camera import StreamImages
+from services.comm.can_ports import StreamPort
+from services.comm.client import Client
+from services.comm.directory import load
+from services.comm.messages import Hello, Outcome
+from sim.realtime import LaboratoryShell, bus_channel, camera_address
+from sim.track_laboratory import TrackLaboratory
+from sim.truth import LaboratoryError
+
+REPOSITORY = Path(__file__).parents[3]
+NUMBERS = itertools.count(1)
+PATIENCE = 60.0
+"""s of wall time within which what must come has come, on a machine out of breath."""
+
+
+def services_file(folder: Path, sim: str = "sim.track_laboratory:make_laboratory") -> Path:
+    """The shipped location file with free ports, its devices named by hand."""
+    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(4)]
+    node, bus, camera, coordinator = (one.getsockname()[1] for one in sockets)
+    for one in sockets:
+        one.close()
+    file = folder / "services.toml"
+    file.write_text(f"""\
+schema = 1
+[nodes.laboratory]
+host = "127.0.0.1"
+port = {node}
+sim = "{sim}"
+[nodes.drive]
+host = "127.0.0.1"
+port = {coordinator}
+[devices.rover]
+node = "drive"
+driver = "nowhere:Rover"
+interface = "petrobot_stream"
+channel = "tcp://127.0.0.1:{bus}"
+[devices.camera]
+node = "drive"
+driver = "nowhere:Camera"
+source = "sim"
+address = "127.0.0.1:{camera}"
+[services.laboratory_prepare]
+node = "laboratory"
+[services.laboratory_score]
+node = "laboratory"
+[services.laboratory_fault]
+node = "laboratory"
+[parameters]
+rover = "{REPOSITORY / "services" / "mobile" / "rover.toml"}"
+""")
+    return file
+
+
+async def until(holds: Callable[[], bool]) -> None:
+    """Look every 2 ms whether it holds."""
+    pause = threading.Event()
+    async with asyncio.timeout(PATIENCE):
+        while not holds():
+            await asyncio.to_thread(pause.wait, 0.002)
+
+
+@pytest.fixture
+async def shell(tmp_path: Path) -> AsyncIterator[LaboratoryShell]:
+    running = LaboratoryShell(load(services_file(tmp_path)), "laboratory")
+    await running.start()
+    yield running
+    await running.close()
+
+
+async def call(address: tuple[str, int], service: str, **arguments: Any) -> Outcome:
+    # a name of its own for each: a caller of one name and boot numbers its calls from 1
+    caller = Caller("laboratory", Hello(1, 99, "client", f"test {next(NUMBERS)}", "boot"))
+    client = Client(*address, caller, on_notices=lambda now, notices: None)
+    client.start()
+    try:
+        async with asyncio.timeout(PATIENCE):
+            return await client.call(service, arguments, deadline=PATIENCE)
+    finally:
+        await client.close()
+
+
+async def test_the_rover_drives_over_the_bus(shell: LaboratoryShell, rover_master: Callable[[], Any]) -> None:
+    lab = shell.laboratory
+    assert isinstance(lab, TrackLaboratory)
+    answer = await call(shell.server.address, "laboratory_prepare", seed=3, regime="plain")
+    assert answer.status == "success"
+    port = StreamPort(bus_channel(shell._directory))
+    master, last = rover_master(), [0.0]
+
+    def exchange() -> None:
+        if lab.now - last[0] >= 0.02:
+            last[0] = lab.now
+            for frame in master.frames():
+                port.send(frame)
+        master.take(port.receive())
+
+    def enabled() -> bool:
+        exchange()
+        return bool(master.enabled)
+
+    def far() -> bool:
+        exchange()
+        return float(lab.referee.score(lab.now)["way_m"]) > 0.2
+
+    await until(enabled)
+    master.wanted = [4.0, 4.0]
+    await until(far)
+    assert master.echoes is not None
+    score = (await call(shell.server.address, "laboratory_score")).values
+    assert score["way_m"] > 0.2
+    assert score["penalties"] == []
+    port.close()
+
+
+async def test_images_come_over_the_wire(shell: LaboratoryShell) -> None:
+    address = camera_address(shell._directory)
+    assert address is not None
+    images = StreamImages(*address, time.monotonic)
+    images.start(25.0)
+    found: list[Any] = []
+
+    def take() -> bool:
+        image = images.newest()
+        if image is not None:
+            found.append((image, time.monotonic() - image.time))
+        return len(found) >= 5
+
+    await until(take)
+    images.close()
+    assert {image.pixels.shape for image, _ in found} == {(120, 160)}
+    assert all(age >= 0.008 for _, age in found)
+    assert len({image.sequence for image, _ in found}) == 5
+
+
+async def test_faults_and_refusals_are_answered(shell: LaboratoryShell) -> None:
+    address = shell.server.address
+    assert (await call(address, "laboratory_fault", kind="dead_sensor", duration=1.0)).status == "success"
+    refused = await call(address, "laboratory_prepare", regime="arcs+fog")
+    assert (refused.status, refused.cause) == ("error", "bad_arguments")
+    assert "'fog'" in refused.text
+
+
+def test_what_makes_no_laboratory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "odd_laboratory.py").write_text("def make(directory, name):\n    return object()\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(LaboratoryError, match="LaboratoryParty"):
+        LaboratoryShell(load(services_file(tmp_path, "odd_laboratory:make")), "laboratory")
+
+
+def test_as_a_process_it_serves_until_told_to_end(tmp_path: Path) -> None:
+    file = services_file(tmp_path)
+    directory = load(file)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "sim", "--services", str(file)], cwd=REPOSITORY, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stdout is not None
+        assert "ready" in process.stdout.readline()
+        prepared = asyncio.run(call(directory.address("laboratory"), "laboratory_prepare", seed=2, regime="contest"))
+        assert prepared.status == "success"
+        score = asyncio.run(call(directory.address("laboratory"), "laboratory_score")).values
+        assert (score["interruptions"], score["finished"]) == (3, False)
+    finally:
+        os.kill(process.pid, signal.SIGTERM)
+        assert process.wait(PATIENCE) == 0
+        if process.stdout is not None:
+            process.stdout.close()
