@@ -7,7 +7,7 @@ come from the caller, too.
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,10 +19,12 @@ from coordinator.analysis.gspn import Gspn
 from coordinator.analysis.netfile import FormatError, NetFile
 from coordinator.analysis.ordinary import OrdinaryView
 from coordinator.analysis.picture import graph_svg
-from coordinator.analysis.report import analyse
+from coordinator.analysis.report import Analysis, analyse
 from coordinator.analysis.simulate import Estimate, Simulation, goal_by_marking, simulate
 from coordinator.analysis.space import EngineName, Limits, explore
-from coordinator.analysis.stochastic import NoEstimate, stochastic_view, what_if
+from coordinator.analysis.stochastic import Measured, NoEstimate, stochastic_view
+from coordinator.analysis.whatif import Change, change_gspn, change_net, change_task, read_change
+from coordinator.net import Net
 from coordinator.task import Place, Task, Transition
 
 OK, FAULT, BAD_INPUT = 0, 1, 2
@@ -37,6 +39,8 @@ class Outcome:
     code: int
     text: str
     data: dict[str, Any]
+    analysis: Analysis | None = None
+    """What `analyse` found, for pictures of its witnesses."""
 
 
 def open_model(path: Path, load_task: LoadTask) -> Task | NetFile:
@@ -87,23 +91,59 @@ def analyse_command(
     limits: Limits | None = None,
     engine: EngineName = "auto",
     structure: bool = True,
+    changes: Sequence[str] = (),
 ) -> Outcome:
     """`petrobot analyse`: code 0 if bounded and free from deadlock, 1 if not (or unknown), 2 for bad input.
 
-    `rates` is a rates file, or "unit"; rates found in the net file itself are used when `view` is "gspn".
+    `rates` is a rates file, or "unit"; rates found in the net file itself are used when `view` is "gspn". `changes` (see
+    `whatif`) are judged beside the file as it is: the code and the text are those of what would be.
     """
+
+    def found(subject: Subject, measured: Measured | None) -> Analysis:
+        return analyse(subject, name=name or path.stem, view=view, measured=measured, stages=stages, limits=limits,
+                       engine=engine)  # fmt: skip
+
     try:
         model = open_model(path, load_task)
         subject, name, notes = _subject(model, rates, view)
-        found = analyse(subject, name=name or path.stem, view=view, stages=stages, limits=limits, engine=engine)
+        now = found(subject, None)
+        wanted = [read_change(text) for text in changes]
+        then = found(*_changed(subject, wanted)) if wanted else now
     except FormatError as error:
         return Outcome(BAD_INPUT, str(error), {"error": str(error)})
-    data = found.to_json(structure=structure)
-    text = "\n".join([found.text(), *(f"note: {note}" for note in notes)])
-    return Outcome(OK if found.ok else FAULT, text, data | {"notes": [*data["notes"], *notes]})
+    data = then.to_json(structure=structure)
+    said = [then.text(), *(f"note: {note}" for note in notes)]
+    if wanted:
+        what = [change.text for change in wanted]
+        data |= {"what_if": what, "as_it_is": now.to_json(structure=False)}
+        said += ["", f"what if {', '.join(what)}:", *_compared(now, then)]
+    return Outcome(OK if then.ok else FAULT, "\n".join(said), data | {"notes": [*data["notes"], *notes]}, analysis=then)
 
 
-def _subject(model: Task | NetFile, rates: Path | str | None, view: str) -> tuple[Any, str, tuple[str, ...]]:
+Subject = Task | Net | Gspn
+
+
+def _changed(subject: Subject, changes: Sequence[Change]) -> tuple[Subject, Measured | None]:
+    if isinstance(subject, Task):
+        return change_task(subject, Measured(), changes)
+    return (change_gspn(subject, changes) if isinstance(subject, Gspn) else change_net(subject, changes)), None
+
+
+def _compared(now: Analysis, then: Analysis) -> list[str]:
+    """A table of what a change alters: verdicts, then numbers."""
+    words = {True: "yes", False: "NO", None: "unknown"}
+    rows = [
+        (name.replace("_", " "), words[before.holds], words[after.holds])
+        for (name, before), after in zip(now.verdicts().items(), then.verdicts().values(), strict=True)
+        if before.holds is not after.holds
+    ]
+    one, other = now.figures(), then.figures()
+    rows += [(name, f"{one[name]:.6g}", f"{other[name]:.6g}") for name in one if name in other]
+    lines = [f"  {'':28}{'as it is':>14}{'what if':>14}"]
+    return [*lines, *(f"  {name:28}{before:>14}{after:>14}" for name, before, after in rows)]
+
+
+def _subject(model: Task | NetFile, rates: Path | str | None, view: str) -> tuple[Subject, str, tuple[str, ...]]:
     """(what to analyse, its name, notes)."""
     if isinstance(model, Task):
         return model, model.name, ()
@@ -112,9 +152,11 @@ def _subject(model: Task | NetFile, rates: Path | str | None, view: str) -> tupl
     if rates is not None:
         path = Path(rates)
         return read_rates(_text(path), str(path), model), model.name, model.notes
-    if view == "gspn" and model.gspn is None:
+    if view != "gspn":
+        return model.net, model.name, model.notes
+    if model.gspn is None:
         raise FormatError(model.name or "net", "rates", "the file says none", "give --rates FILE, or --rates unit")
-    return (model.gspn if view == "gspn" else model.net), model.name, model.notes
+    return model.gspn, model.name, model.notes
 
 
 def _text(path: Path) -> str:
@@ -135,22 +177,23 @@ def simulate_command(
     warmup: float = 0.0,
     firings: int = 10_000_000,
     stages: int = 64,
-    tokens: Mapping[str, int] | None = None,
+    changes: Sequence[str] = (),
     progress: Callable[[int, float], None] | None = None,
 ) -> Outcome:
-    """`petrobot simulate`: a task until it is final (or dead), a net until `horizon` (s; needed there). `tokens`: what if."""
+    """`petrobot simulate`: a task until it is final (or dead), a net until `horizon` (s; needed there); `changes` as `whatif`."""
     try:
-        model = open_model(path, load_task)
+        model, wanted = open_model(path, load_task), [read_change(text) for text in changes]
         if isinstance(model, Task):
-            view = stochastic_view(model, stages=stages, timer_stages=stages)
-            view = what_if(view, tokens) if tokens else view
+            model, measured = change_task(model, Measured(), wanted)
+            view = stochastic_view(model, measured, stages=stages, timer_stages=stages)
             ends = OrdinaryView(model)
             goal = goal_by_marking(lambda m: ends.is_final(view.projected(m)))
             seen = simulate(view.gspn, random, replicas=replicas, horizon=horizon or np.inf, warmup=warmup, goal=goal,
                             firings=firings, progress=progress)  # fmt: skip
             return _simulated(model.name, seen, view.assumptions)
         subject, name, notes = _subject(model, rates, "gspn")
-        gspn: Gspn = subject.marked(tokens) if tokens else subject
+        assert isinstance(subject, Gspn)
+        gspn = change_gspn(subject, wanted)
         if horizon is None:
             raise FormatError(str(path), "horizon", "a net has no end of its own", "give --horizon SECONDS")
         seen = simulate(

@@ -14,7 +14,7 @@ from coordinator.analysis.gspn import Chain, Gspn
 from coordinator.analysis.markov import LongRun, long_run
 from coordinator.analysis.ordinary import OrdinaryView
 from coordinator.analysis.qualitative import Qualitative, examine
-from coordinator.analysis.robot import Recovery, RobotVerdicts, judge
+from coordinator.analysis.robot import Recovery, RobotVerdicts, judge, one_run_each
 from coordinator.analysis.siphons import PlaceSets, controlled_siphons, minimal_siphons, minimal_traps
 from coordinator.analysis.space import EngineName, Limits, explore
 from coordinator.analysis.stochastic import Measured, stochastic_view
@@ -29,7 +29,7 @@ from coordinator.analysis.structure import (
 )
 from coordinator.analysis.verdict import Verdict
 from coordinator.net import Net
-from coordinator.task import Task
+from coordinator.task import Kind, Task
 
 SHOWN = 20
 """Entries of a list that the text shows."""
@@ -95,6 +95,8 @@ class Analysis:
     run: LongRun | None
     forecast: Forecast | None
     notes: tuple[str, ...]
+    one_run_each: Verdict | None = None
+    """Of a task: whether no action place is entered while its run goes on."""
 
     @property
     def progress(self) -> Qualitative:
@@ -103,8 +105,9 @@ class Analysis:
 
     @property
     def ok(self) -> bool:
-        """Whether nothing speaks against running it: bounded and free from deadlock (live is for closed nets to ask)."""
-        return self.qualitative.bounded.holds is True and self.qualitative.deadlock_free.holds is True
+        """Whether nothing speaks against running it: bounded, free from deadlock, one run at a time in an action place."""
+        crowded = self.one_run_each is not None and self.one_run_each.holds is not True
+        return self.qualitative.bounded.holds is True and self.qualitative.deadlock_free.holds is True and not crowded
 
     def to_json(self, *, structure: bool = True) -> dict[str, Any]:
         """Plain data with the promised keys: verdicts are true, false or null."""
@@ -160,11 +163,25 @@ class Analysis:
             }
         return {}
 
+    def figures(self) -> dict[str, float]:
+        """The numbers by which two analyses are compared."""
+        if self.forecast is not None:
+            f = self.forecast
+            goal = {} if f.goal_reliability is None else {"R_goal": f.goal_reliability}
+            shape = {"90 % quantile of the time (s)": f.law().quantile(0.9)} if f.completion_probability > 0 else {}
+            own = {"P_complete": f.completion_probability, **goal, "R_conj": f.conjunctive_reliability}
+            return own | {"mean time (s)": f.done.mean} | shape
+        if self.run is not None:
+            return {f"throughput of {t} (1/s)": x for t, x in self.run.throughput.items()}
+        return {"markings": len(self.qualitative.space)}
+
     def verdicts(self) -> dict[str, Verdict]:
         """All verdicts by name, in robot words where the net is a task."""
         q, again = self.qualitative, self.progress
         out = {"bounded": q.bounded, "safe": q.safe, "deadlock_free": q.deadlock_free, "quasi_live": q.quasi_live}
         out |= {"live": again.live, "proper" if self.closed else "reversible": again.reversible}
+        if self.one_run_each is not None:
+            out["one_run_each"] = self.one_run_each
         if q.sound is not None:
             out["sound"] = q.sound
         if self.robot is not None:
@@ -268,9 +285,10 @@ def _analyse_task(
             numbers = forecast(stochastic_view(task, measured, stages=stages), limits=limits)
         except (ValueError, ArithmeticError) as why:
             notes.append(f"no forecast: {why}")
-    return Analysis(
-        task.name, ordinary.net, qualitative, closed, robot, Structure(ordinary.net), None, numbers, tuple(notes)
-    )
+    single = [p.name for p in task.flat.places.values() if p.kind is Kind.ACTION and p.servers is None]
+    alone = one_run_each(space, single)
+    whole = Structure(ordinary.net)
+    return Analysis(task.name, ordinary.net, qualitative, closed, robot, whole, None, numbers, tuple(notes), alone)
 
 
 def _sizes(net: Net) -> dict[str, int]:

@@ -16,7 +16,7 @@ The paper leaves open how boundedness, properness and liveness map to these (sec
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -73,6 +73,19 @@ class RobotVerdicts:
     controllable: Verdict
     unforced: tuple[str, ...]
     """Action places that cannot be forced to start from everywhere."""
+
+
+def one_run_each(space: Space, places: Sequence[str]) -> Verdict:
+    """Whether no action place is entered while its run goes on: each of `places` holds one token at most (design: 1-safe)."""
+    for name in places:
+        crowded = np.flatnonzero(space.tokens(space.net.place_index[name]) > 1)
+        if len(crowded):
+            shown = witness(space, int(crowded[0]))
+            reason = f"{name} is entered while its run still goes on: {shown.marking[name]} tokens, one run at a time"
+            return Verdict(False, reason, shown, complete=space.complete)
+    if not space.complete:
+        return Verdict(None, f"the search stopped: {space.reason}", complete=False)
+    return Verdict(True, "no action place is entered while its run goes on")
 
 
 class Flow:

@@ -10,7 +10,7 @@ flushed at once, and a repeated run draws afresh.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
 
@@ -356,11 +356,3 @@ class _Derivation:
         for i in t.inhibitors:
             back = {i.place: i.threshold}
             self._immediate(f"{name}.barred {i.place}", {count: 1, **back}, back, 1.0, FLUSH)
-
-
-def what_if(view: StochasticView, tokens: Mapping[str, int]) -> StochasticView:
-    """The same view with other initial tokens in some places of the task that run no action. Raises ValueError."""
-    for name in tokens:
-        if name not in view.task.flat.places or view.task.flat.places[name].kind is Kind.ACTION:
-            raise ValueError(f"{name!r} is no resource or control place of the task")
-    return replace(view, gspn=view.gspn.marked(tokens))

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coordinator.cli.loading import task_path, write_json
 
 if TYPE_CHECKING:
     from coordinator.analysis.commands import Outcome
+    from coordinator.analysis.report import Analysis
+    from coordinator.analysis.space import Limits
 
-EXAMPLE = "petrobot analyse catch_ball --json analysis.json"
+EXAMPLE = "petrobot analyse catch_ball --view gspn --what-if locate_ball.error.share=0.01"
+TOLD_EVERY, TOLD_AFTER = 0.5, 2.0
+"""Seconds between lines of progress, and before the first."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -26,6 +34,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seconds", type=float, metavar="S", help="longest search; what was found until then is told")
     parser.add_argument("--memory", type=int, default=2048, metavar="MIB", help="most memory (default: %(default)s)")
+    parser.add_argument(
+        *("--what-if", "-w"),
+        action="append",
+        default=[],
+        metavar="CHANGE",
+        help="judge a change beside the file as it is: runs=10, locate_ball.error.share=0.05, serve.rate=2 (may be repeated)",
+    )
+    parser.add_argument(
+        "--pictures", metavar="FOLDER", help="draw each refused verdict with the firings that lead there"
+    )
     parser.add_argument("--json", metavar="FILE", help="write the answer as JSON (- for standard output)")
 
 
@@ -37,7 +55,48 @@ def run(options: argparse.Namespace) -> int:
 
     limits = Limits(states=options.states, seconds=options.seconds, memory=options.memory << 20, clock=time.monotonic)
     path = task_path(options.file)
-    return give(analyse_command(path, load, view=options.view, rates=options.rates, limits=limits), options.json)
+    with progress_of_search(limits) as watched:
+        outcome = analyse_command(
+            path, load, view=options.view, rates=options.rates, limits=watched, changes=options.what_if
+        )
+    code = give(outcome, options.json)
+    if options.pictures and outcome.analysis is not None:
+        _draw(outcome.analysis, path, Path(options.pictures), quiet=options.json == "-")
+    return code
+
+
+def _draw(analysis: Analysis, path: Path, folder: Path, *, quiet: bool) -> None:
+    from coordinator.cli.witnesses import draw_witnesses
+    from coordinator.taskfile import load
+
+    made = draw_witnesses(analysis, load(path) if path.suffix == ".toml" else analysis.net, folder)
+    if not quiet:
+        print("\n".join(f"drawn: {picture}" for picture in made) or "no picture: nothing was refused with a witness")
+
+
+@contextmanager
+def progress_of_search(limits: Limits) -> Iterator[Limits]:
+    """The same limits with a line on the terminal that tells how far a long search is; nothing elsewhere."""
+    from coordinator.analysis.commands import limited
+
+    if not sys.stderr.isatty():
+        yield limits
+        return
+    begun, told = time.monotonic(), [0.0]
+
+    def tell(found: int, expanded: int) -> None:
+        now = time.monotonic()
+        if now - told[0] >= TOLD_EVERY and now - begun >= TOLD_AFTER:
+            told[0] = now
+            print(
+                f"\r{found} markings found, {expanded} looked at, {now - begun:.0f} s (Ctrl-C: what is known by now)",
+                end="",
+                file=sys.stderr,
+            )
+
+    yield limited(limits, tell)
+    if told[0]:
+        print(file=sys.stderr)
 
 
 def give(outcome: Outcome, json_file: str | None) -> int:

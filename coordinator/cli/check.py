@@ -54,9 +54,10 @@ def _analysed(task: Task) -> Analysis:
 
 
 def _stuck(analysis: Analysis) -> bool:
-    """Whether the task is known to be unbounded or to come to a deadlock; what was not settled in time does not forbid it."""
-    found = analysis.qualitative
-    return found.bounded.holds is False or found.deadlock_free.holds is False
+    """Whether it is known to grow without bound, to come to a deadlock or to start a run while its place is at work; what was
+    not settled in time does not forbid it."""
+    verdicts = analysis.verdicts()
+    return any(verdicts[name].holds is False for name in ("bounded", "deadlock_free", "one_run_each"))
 
 
 def _plain(report: Report) -> list[dict[str, str]]:
@@ -78,5 +79,5 @@ def _text(name: str, report: Report, analysis: Analysis | None, ok: bool) -> str
         )
         lines.append(f"{len(analysis.qualitative.space)} markings: {', '.join(told)}{searched}")
         if _stuck(analysis):
-            lines.append(f"petrobot analyse {name} shows how it comes to that")
+            lines.append(f"petrobot analyse {name} --pictures FOLDER shows how it comes to that")
     return "\n".join([*lines, f"{name}: {'may run' if ok else 'may not run'}"])

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from coordinator.cli import CommandError
 from coordinator.cli.loading import load_task, task_path
+
+if TYPE_CHECKING:
+    from coordinator.drawing import Overlay
+    from coordinator.task import Task
 
 EXAMPLE = "petrobot show catch_ball --errors --out catch_ball.svg"
 
@@ -16,14 +21,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("task", help="a task file, or the name of a task that comes with petrobot")
     parser.add_argument("--errors", action="store_true", help="draw the error branches too")
     parser.add_argument("--graph", action="store_true", help="draw the reachability graph instead (of any net file)")
+    parser.add_argument("--heat", action="store_true", help="colour the action places by their share of the mean time")
     parser.add_argument("--out", metavar="FILE", default="-", help="where to write the SVG (default: standard output)")
 
 
 def run(options: argparse.Namespace) -> int:
     """Draw."""
-    from coordinator.drawing import draw
-
-    svg = _graph(options.task) if options.graph else draw(load_task(options.task), error_branches=options.errors)
+    svg = _graph(options.task) if options.graph else _net(options.task, errors=options.errors, heat=options.heat)
     if options.out == "-":
         print(svg)
         return 0
@@ -32,6 +36,27 @@ def run(options: argparse.Namespace) -> int:
     except OSError as fault:
         raise CommandError(2, f"{options.out}: {fault.strerror or fault}") from fault
     return 0
+
+
+def _net(name: str, *, errors: bool, heat: bool) -> str:
+    from coordinator.drawing import draw
+
+    task = load_task(name)
+    return draw(task, error_branches=errors, overlay=_heat(task) if heat else None)
+
+
+def _heat(task: Task) -> Overlay:
+    """The forecast's bottleneck: how much of the mean time each action place takes. Raises CommandError."""
+    from coordinator.analysis.report import analyse, heat
+    from coordinator.drawing import Overlay
+
+    analysis = analyse(task, view="gspn")
+    shares = heat(analysis)
+    if not shares:
+        raise CommandError(2, f"{task.name}: no heat without a forecast: {'; '.join(analysis.notes)}")
+    most = max(shares, key=lambda place: shares[place])
+    told = f"Warm: share of the mean time by the forecast; the bottleneck is {most} with {100 * shares[most]:.0f} %."
+    return Overlay(heat=shares, legend=told)
 
 
 def _graph(name: str) -> str:

@@ -18,6 +18,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--replicas", type=int, default=1000, metavar="N", help="how often (default: %(default)s)")
     parser.add_argument("--horizon", type=float, metavar="S", help="simulated seconds; a net that never ends needs it")
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="default: %(default)s")
+    parser.add_argument(
+        "--what-if",
+        "-w",
+        action="append",
+        default=[],
+        metavar="CHANGE",
+        help="as of `petrobot analyse` (may be repeated)",
+    )
     parser.add_argument("--json", metavar="FILE", help="write the answer as JSON (- for standard output)")
 
 
@@ -31,4 +39,5 @@ def run(options: argparse.Namespace) -> int:
 
     random = np.random.default_rng(options.seed)
     given = {"rates": options.rates, "replicas": options.replicas, "horizon": options.horizon}
+    given["changes"] = options.what_if
     return give(simulate_command(task_path(options.file), load, random, **given), options.json)

@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
-from coordinator.drawing.scene import scene_of_net, scene_of_task
+from coordinator.drawing.scene import Overlay, scene_of_net, scene_of_task
 from coordinator.drawing.svg import render
 from coordinator.net import Marking, Net
 from coordinator.task import Task
 
-__all__ = ["draw"]
+__all__ = ["Overlay", "draw"]
 
 
 def draw(
-    model: Task | Net, *, error_branches: bool = False, marking: Marking | None = None, title: str | None = None
+    model: Task | Net,
+    *,
+    error_branches: bool = False,
+    marking: Marking | None = None,
+    title: str | None = None,
+    overlay: Overlay | None = None,
 ) -> str:
     """SVG of the model.
 
     A task is drawn as its file has it: macro places stay folded, and so do error branches unless `error_branches`; a
-    badge on a place counts its hidden exits. `marking` (of `Task.net`, or of the net) replaces the initial tokens.
+    badge on a place counts its hidden exits. `marking` (of `Task.net`, or of the net) replaces the initial tokens; `overlay`
+    colours nodes and numbers the firings of a path.
     """
-    if isinstance(model, Net):
-        return render(scene_of_net(model, marking, title))
-    return render(scene_of_task(model, error_branches, marking, title))
+    scene = (
+        scene_of_net(model, marking, title)
+        if isinstance(model, Net)
+        else scene_of_task(model, error_branches, marking, title)
+    )
+    return render(scene.under(overlay) if overlay else scene)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 from coordinator.drawing.layout import Point, lay_out
 from coordinator.net import Marking, Net
@@ -12,6 +12,8 @@ from coordinator.task import End, Kind, Place, Scope, Task, Transition
 RADIUS = 21.0
 BAR = (4.0, 21.0)
 """Half thickness and half length of a transition."""
+TURNS = 4
+"""Firings of one transition that are numbered along a path."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +31,10 @@ class Node:
     """Folded error exits."""
     upright: bool = True
     """Transitions: the bar stands."""
+    heat: float | None = None
+    """How warm its halo is, 0 to 1."""
+    turns: str = ""
+    """Transitions: when they fire along a path, such as "2, 5"."""
 
     @property
     def half(self) -> tuple[float, float]:
@@ -36,6 +42,26 @@ class Node:
         if self.is_place:
             return RADIUS, RADIUS
         return BAR if self.upright else (BAR[1], BAR[0])
+
+
+@dataclass(frozen=True, slots=True)
+class Overlay:
+    """What is told over a drawing: a halo for each place or transition (0 to 1), and a path of firings, numbered."""
+
+    heat: Mapping[str, float] = field(default_factory=dict)
+    path: Sequence[str] = ()
+    legend: str = ""
+
+    def on(self, node: Node) -> Node:
+        """The node with what is told of it; what lies inside a macro place is told of that place."""
+        heat = [h for name, h in self.heat.items() if node.name in (name, name.partition(".")[0])]
+        turns = [str(i) for i, name in enumerate(self.path, 1) if node.name in (name, name.partition(".")[0])]
+        if not heat and not turns:
+            return node
+        share = min(1.0, sum(heat)) if heat else None
+        hint = node.hint + (f": {100 * share:.0f} %" if share is not None else "")
+        shown = turns if len(turns) <= TURNS else [*turns[: TURNS - 1], f"… {turns[-1]}"]
+        return replace(node, heat=share, turns=", ".join(shown), hint=hint)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +83,12 @@ class Scene:
     text: str
     nodes: Mapping[str, Node]
     arcs: tuple[Arc, ...] = field(default=())
+    legend: str = ""
+
+    def under(self, overlay: Overlay) -> Scene:
+        """The same scene with an overlay."""
+        nodes = {name: overlay.on(node) for name, node in self.nodes.items()}
+        return replace(self, nodes=nodes, legend=overlay.legend)
 
 
 def scene_of_task(task: Task, error_branches: bool, marking: Marking | None, title: str | None) -> Scene:

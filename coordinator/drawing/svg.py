@@ -43,6 +43,10 @@ text{font:12.5px system-ui,-apple-system,"Segoe UI","DejaVu Sans",sans-serif;fil
 .bar.error{stroke:#c0262d}
 .weight{font-size:11px}
 .halo{stroke:#ffffff;stroke-width:3.5px;stroke-linejoin:round}
+.warm{fill:#e8590c}
+.turn{fill:#7a1fa2;font-size:11px;font-weight:700}
+.fired{fill:none;stroke:#7a1fa2;stroke-width:2.4}
+.legend{font-size:12px}
 .badge{fill:#c0262d}
 .badge-text{fill:#ffffff;font-size:10px;font-weight:700}
 @media (prefers-color-scheme:dark){
@@ -66,6 +70,8 @@ text{fill:#e6eaf0}
 .bar{fill:#12161d;stroke:#aab4c3}
 .bar.error{stroke:#ff7b81}
 .halo{stroke:#12161d}
+.turn{fill:#d7a6f0}
+.fired{stroke:#d7a6f0}
 }
 """
 
@@ -87,6 +93,8 @@ def render(scene: Scene) -> str:
     lines += [line for node in scene.nodes.values() for line in _node(node, badge_spot(node, ways))]
     lines += [line for w in words for line in _words(w)]
     lines += [line for way in ways if way.arc.weight > 1 for line in _weight(way)]
+    if scene.legend:
+        lines += _text(scene.legend, left + _MARGIN / 2, top + height - _MARGIN / 2, "start", "legend")
     return "\n".join([*lines, "</svg>", ""])
 
 
@@ -108,12 +116,14 @@ def _frame(scene: Scene, ways: Sequence[Way], words: Sequence[Words]) -> tuple[f
     points += [p for w in words for p in ((w.box[0], w.box[1]), (w.box[2], w.box[3]))]
     xs, ys = [x for x, _ in points] or [0.0], [y for _, y in points] or [0.0]
     left, top = round(min(xs) - _MARGIN), round(min(ys) - _MARGIN)
-    return left, top, round(max(xs) + _MARGIN) - left, round(max(ys) + _MARGIN) - top
+    width = max(round(max(xs) + _MARGIN) - left, round(6.2 * len(scene.legend)))
+    return left, top, width, round(max(ys) + _MARGIN + (LINE if scene.legend else 0.0)) - top
 
 
 def _node(node: Node, badge: Point) -> Iterator[str]:
     (x, y), (w, h) = node.at, node.half
     yield f'<g id="{escape(node.name, {chr(34): "&quot;"})}"><title>{escape(node.hint)}</title>'
+    yield from _told(node)
     if node.is_place:
         yield f'<circle class="{node.style}" cx="{x:g}" cy="{y:g}" r="{RADIUS:g}"/>'
         if "action" in node.style.split() or "macro" in node.style.split():
@@ -124,6 +134,18 @@ def _node(node: Node, badge: Point) -> Iterator[str]:
     else:
         yield f'<rect class="{node.style}" x="{x - w:g}" y="{y - h:g}" width="{2 * w:g}" height="{2 * h:g}" rx="1"/>'
     yield "</g>"
+
+
+def _told(node: Node) -> Iterator[str]:
+    """The overlay: a halo, and the turns at which a transition fires."""
+    (x, y), (w, h) = node.at, node.half
+    if node.heat is not None:
+        shape = f'width="{2 * w + 20:g}" height="{2 * h + 20:g}" rx="{w + 10:g}"'
+        opacity = 0.06 + 0.84 * node.heat
+        yield f'<rect class="warm" fill-opacity="{opacity:.2f}" x="{x - w - 10:g}" y="{y - h - 10:g}" {shape}/>'
+    if node.turns:
+        yield f'<rect class="fired" x="{x - w - 4:g}" y="{y - h - 4:g}" width="{2 * w + 8:g}" height="{2 * h + 8:g}" rx="5"/>'
+        yield from _text(node.turns, x + w + 8, y - h - 4, "start", "turn")
 
 
 def _tokens(node: Node) -> Iterator[str]:

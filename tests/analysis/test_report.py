@@ -143,7 +143,7 @@ def test_simulation_and_solution_of_the_catching_task_agree() -> None:
     mean, low, high = seen.data["time"]
     assert low - (high - low) < exact.done.mean < high + (high - low)
     assert seen.data["quantiles"]["0.9"] == pytest.approx(exact.law().quantile(0.9), rel=0.1)
-    fewer = simulate_command(CATCH, load, np.random.default_rng(5), replicas=200, stages=3, tokens={"runs": 1})
+    fewer = simulate_command(CATCH, load, np.random.default_rng(5), replicas=200, stages=3, changes=["runs=1"])
     assert fewer.data["time"][0] < mean / 2
 
 

@@ -19,7 +19,7 @@ from coordinator.analysis.ordinary import OrdinaryView
 from coordinator.analysis.qualitative import examine
 from coordinator.analysis.robot import judge
 from coordinator.analysis.space import Limits, explore
-from coordinator.analysis.stochastic import Measured, NoEstimate, StochasticView, stochastic_view, what_if
+from coordinator.analysis.stochastic import Measured, NoEstimate, StochasticView, stochastic_view
 from coordinator.conditions import parse
 from coordinator.task import (
     Counts,
@@ -217,19 +217,6 @@ def test_what_cannot_be_told_is_refused_with_a_remedy() -> None:
     stop = Transition("stop", (taken("act", End.PREEMPT, Counts.NONE),), (Output("idle"),), events=("tick",))
     with pytest.raises(ValueError, match="one server for the forecast"):
         stochastic_view(replace(several, transitions={**several.transitions, "stop": stop}))
-
-
-def test_what_if_tokens_change() -> None:
-    task = load(SHIPPED[0])
-    view = stochastic_view(task, stages=1, timer_stages=1)
-    ordinary = OrdinaryView(task)
-    means = []
-    for runs in (1, 2):
-        chain = Chain.of(what_if(view, {"runs": runs}).gspn)
-        means.append(completion(chain, chain.space.where(ordinary.is_final) & ~chain.vanishing).mean)
-    assert means[1] == pytest.approx(2 * means[0], rel=1e-3)
-    with pytest.raises(ValueError, match="no resource or control place"):
-        what_if(view, {"locate_ball": 1})
 
 
 @st.composite

@@ -1,0 +1,85 @@
+"""Deliberately broken variants of a task: what a designer gets wrong, and the analysis must catch.
+
+`python -m tests.analysis.broken FOLDER TASK...` draws what is found of each for docs/.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from coordinator.analysis.report import Analysis, analyse
+from coordinator.analysis.space import Limits
+from coordinator.cli.witnesses import picture, refused
+from coordinator.task import End, Kind, Task, Transition
+from coordinator.taskfile import load
+
+TASKS = Path(__file__).parents[2] / "coordinator" / "tasks"
+LIMITS = Limits(states=20_000)
+
+
+def _with(task: Task, transition: Transition) -> Task:
+    return replace(task, transitions={**task.transitions, transition.name: transition})
+
+
+def error_exits(task: Task) -> list[Transition]:
+    """Transitions that take a run which ended with ERROR, in the file's order."""
+    return [t for t in task.transitions.values() if any(a.end is End.ERROR for a in t.inputs) and t.outputs]
+
+
+def missing_recovery(task: Task) -> Task:
+    """The first error exit gives nothing back: what the failed run held is lost."""
+    return _with(task, replace(error_exits(task)[0], outputs=()))
+
+
+def double_resource(task: Task) -> Task:
+    """Every resource is there twice, so that two runs may want one device at a time."""
+    places = {
+        name: replace(p, tokens=2, capacity=None) if p.kind is Kind.RESOURCE and p.tokens == 1 else p
+        for name, p in task.places.items()
+    }
+    return replace(task, places=places)
+
+
+def leaking_token(task: Task) -> Task:
+    """The first error exit gives a resource back twice: each error adds a token."""
+    exit_ = next(t for t in error_exits(task) if _resource(task, t))
+    resource = _resource(task, exit_)
+    assert resource is not None
+    outputs = tuple(replace(o, weight=2) if o.place == resource else o for o in exit_.outputs)
+    place = replace(task.places[resource], capacity=None)
+    return replace(_with(task, replace(exit_, outputs=outputs)), places={**task.places, resource: place})
+
+
+def _resource(task: Task, t: Transition) -> str | None:
+    return next((o.place for o in t.outputs if task.places[o.place].kind is Kind.RESOURCE), None)
+
+
+VARIANTS: dict[str, Callable[[Task], Task]] = {
+    "missing_recovery": missing_recovery,
+    "double_resource": double_resource,
+    "leaking_token": leaking_token,
+}
+
+
+def judged(task: Task) -> Analysis:
+    """The analysis of a variant; an unbounded one ends early."""
+    return analyse(task, limits=LIMITS)
+
+
+def main(folder: Path, names: list[str]) -> None:
+    """Draw the first refused verdict of each variant."""
+    for name in names:
+        for kind, break_it in VARIANTS.items():
+            task = break_it(load(TASKS / f"{name}.toml"))
+            verdict, why = next(iter(refused(judged(task))))
+            assert why.witness is not None
+            path = folder / f"{name}-{kind}.svg"
+            path.write_text(picture(task, verdict, why.reason, why.witness), encoding="utf-8")
+            print(path, verdict, why.reason)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), sys.argv[2:])

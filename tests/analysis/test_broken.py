@@ -1,0 +1,80 @@
+"""What designers get wrong is caught, with a witness that replays and a picture of it, for every task that ships."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from coordinator.analysis.robot import one_run_each
+from coordinator.analysis.space import Limits, explore
+from coordinator.cli import main
+from coordinator.cli.witnesses import draw_witnesses, refused
+from coordinator.drawing import Overlay, draw
+from coordinator.net import Net
+from coordinator.taskfile import dumps, load
+from tests.analysis.broken import TASKS, VARIANTS, judged
+
+SHIPPED = sorted(TASKS.glob("*.toml"))
+EXPECTED = {"missing_recovery": "deadlock_free", "double_resource": "one_run_each", "leaking_token": "one_run_each"}
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_shipped_tasks_are_sound(path: Path) -> None:
+    """Nothing is refused of what ships, as designed and closed by the refill; every error exit comes back."""
+    found = judged(load(path))
+    verdicts = {name: verdict.holds for name, verdict in found.verdicts().items() if name != "safe"}
+    assert all(verdicts.values()), verdicts
+    assert found.ok and found.robot is not None
+    for recovery in found.robot.recoveries:
+        assert recovery.almost_sure.holds, recovery.error_exit
+
+
+@pytest.mark.parametrize("kind", VARIANTS)
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_broken_variants_are_caught(path: Path, kind: str, tmp_path: Path) -> None:
+    """Each comes with a witness that the net replays, and with a picture that shows where it leads."""
+    task = VARIANTS[kind](load(path))
+    found = judged(task)
+    assert not found.ok
+    bad = dict(refused(found))
+    verdict = bad[EXPECTED[kind]]
+    assert verdict.witness is not None
+    *_, last = task.net.replay(verdict.witness.firings) if verdict.witness.firings else (task.net.initial,)
+    assert {p: n for p, n in zip(task.net.places, last, strict=True) if n} == verdict.witness.marking
+    made = {p.stem: p for p in draw_witnesses(found, task, tmp_path)}
+    root = ElementTree.fromstring(made[f"{task.name}-{EXPECTED[kind]}"].read_text(encoding="utf-8"))
+    texts = [e.text or "" for e in root.iter() if e.get("class") == "turn"]
+    turns = sorted(int(turn) for text in texts for turn in text.replace("…", "").split(",") if turn.strip())
+    assert turns and turns[-1] == len(verdict.witness.firings)
+
+
+def test_the_gate_refuses_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`petrobot check` refuses a broken file, `petrobot analyse --pictures` shows why."""
+    path = tmp_path / "twice.toml"
+    path.write_text(dumps(VARIANTS["double_resource"](load(TASKS / "catch_ball.toml"))), encoding="utf-8")
+    assert main(["check", str(path)]) == 2
+    assert "may not run" in capsys.readouterr().out
+    assert main(["analyse", str(path), "--pictures", str(tmp_path / "why")]) == 1
+    assert "entered while its run still goes on" in capsys.readouterr().out
+    assert (tmp_path / "why" / "catch_ball-one_run_each.svg").exists()
+
+
+def test_a_part_of_the_space_promises_nothing() -> None:
+    """A search that was cut short says that one run at a time is unknown, unless it has seen otherwise."""
+    growing = Net.build({"act": 0, "go": 1}, {"t": ({"go": 1}, {"go": 1, "act": 1}), "u": ({"act": 1}, {})})
+    assert one_run_each(explore(growing, limits=Limits(states=2)), ["act"]).holds is None
+    seen = one_run_each(explore(growing, limits=Limits(states=20)), ["act"])
+    assert seen.holds is False and seen.witness is not None and seen.witness.firings == ("t", "t")
+
+
+def test_an_overlay_colours_and_numbers() -> None:
+    """A halo for each warm place, the turns of a path beside its transitions, a legend below."""
+    net = Net.build({"a": 1, "b": 0}, {"t": ({"a": 1}, {"b": 1}), "u": ({"b": 1}, {"a": 1})})
+    svg = draw(net, overlay=Overlay(heat={"a": 0.25}, path=("t", "u", "t"), legend="what it means"))
+    root = ElementTree.fromstring(svg)
+    assert [e.get("fill-opacity") for e in root.iter() if e.get("class") == "warm"] == ["0.27"]
+    assert {e.text for e in root.iter() if e.get("class") == "turn"} == {"1, 3", "2"}
+    assert any(e.text == "what it means" for e in root.iter())
+    assert "warm" not in {e.get("class") for e in ElementTree.fromstring(draw(net)).iter()}

@@ -1,0 +1,111 @@
+"""What if: one number changed gives what a file with that number gives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from coordinator.analysis.commands import analyse_command, simulate_command
+from coordinator.analysis.netfile import FormatError
+from coordinator.analysis.report import analyse
+from coordinator.analysis.stochastic import Measured
+from coordinator.analysis.whatif import change_net, change_task, read_change
+from coordinator.net import Net
+from coordinator.task import Estimate, Status
+from coordinator.taskfile import dumps, load
+from tests.analysis.broken import TASKS
+
+CATCH = TASKS / "catch_ball.toml"
+
+
+def test_tokens_are_as_in_the_file(tmp_path: Path) -> None:
+    """runs=2 gives what a file with two tokens gives."""
+    edited = tmp_path / "two.toml"
+    task = load(CATCH)
+    two = replace(task, places={**task.places, "runs": replace(task.places["runs"], tokens=2)})
+    edited.write_text(dumps(two), encoding="utf-8")
+    what_if = analyse_command(CATCH, load, view="gspn", stages=2, changes=["runs=2"])
+    as_file = analyse_command(edited, load, view="gspn", stages=2)
+    assert what_if.data["states"] == as_file.data["states"] < what_if.data["as_it_is"]["states"]
+    assert what_if.data["forecast"]["mean"] == pytest.approx(as_file.data["forecast"]["mean"], rel=1e-12)
+    assert "mean time" in what_if.text and what_if.data["what_if"] == ["runs=2"]
+
+
+def test_shares_keep_their_proportions() -> None:
+    """An error share that moves scales the other statuses and leaves other actions alone."""
+    task = load(CATCH)
+    estimates = task.primitive_tasks["locate_ball"].estimates
+    first = task.primitive_tasks["locate_ball"].alternatives[0]
+    change = read_change(f"locate_ball.{first}.error.share=0.5")
+    _, measured = change_task(task, Measured(), [change])
+    (key, found), *others = measured.runs.items()
+    assert key == ("locate_ball", first) and not others
+    assert sum(e.share for e in found.values()) == pytest.approx(1.0)
+    assert found[Status.ERROR] == replace(estimates[Status.ERROR], share=0.5)
+    ratio = found[Status.SUCCESS].share / estimates[Status.SUCCESS].share
+    assert all(found[s].share == pytest.approx(ratio * e.share) for s, e in estimates.items() if s is not Status.ERROR)
+
+
+def test_what_is_improved_improves() -> None:
+    """Fewer errors complete more often; a status that was never seen may be supposed."""
+    task = load(CATCH)
+
+    def complete(*changes: str) -> float:
+        other, measured = change_task(task, Measured(), [read_change(text) for text in changes])
+        found = analyse(other, view="gspn", measured=measured, stages=1).forecast
+        assert found is not None
+        return found.completion_probability
+
+    worse = complete("recover_arm.error.share=0.9")
+    assert worse < complete() < complete("recover_arm.error.share=0.0") <= 1.0
+    sure = {Status.SUCCESS: Estimate(1.0, 0.5)}
+    known = Measured(runs={("recover_arm", a): sure for a in task.primitive_tasks["recover_arm"].alternatives})
+    _, supposed = change_task(task, known, [read_change("recover_arm.error.share=0.25")])
+    (found,) = supposed.runs.values()
+    assert {s: e.share for s, e in found.items()} == {Status.SUCCESS: 0.75, Status.ERROR: 0.25}
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("runs", "no change of one number"),
+        ("runs=many", "no change of one number"),
+        ("runs=1.5", "whole number"),
+        ("locate_ball=1", "no resource or control place"),
+        ("nobody.error.share=0.1", "no number of catch_ball"),
+        ("locate_ball.crash.share=0.1", "no number of catch_ball"),
+        ("locate_ball.nobody.error.share=0.1", "no alternative of locate_ball"),
+        ("locate_ball.error.share=1.5", "out of range"),
+        ("locate_ball.success.mean=0", "out of range"),
+    ],
+)
+def test_what_cannot_be_supposed_is_told(text: str, said: str) -> None:
+    """One clear line, and the exit code for bad input."""
+    outcome = analyse_command(CATCH, load, changes=[text])
+    assert outcome.code == 2 and said in outcome.text and "what if" in outcome.text
+
+
+def test_nets_with_and_without_rates(tmp_path: Path) -> None:
+    """A PNML net: tokens always, rates where it has some."""
+    net = tmp_path / "cycle.net"
+    net.write_text("tr work a -> b\ntr rest b -> a\npl a (1)\n", encoding="utf-8")
+    outcome = analyse_command(net, load, view="gspn", rates="unit", changes=["work.rate=3", "a=2"])
+    assert outcome.data["throughput"]["work"] == pytest.approx(12 / 13, rel=1e-9)
+    assert outcome.data["as_it_is"]["throughput"]["work"] == pytest.approx(0.5)
+    assert analyse_command(net, load, changes=["work.rate=3"]).code == 2
+    with pytest.raises(FormatError, match="no place c"):
+        change_net(Net.build({"a": 1}, {}), [read_change("c=1")])
+
+
+def test_simulation_takes_the_same_changes() -> None:
+    """Runs that a change doubles take twice as long."""
+    import numpy as np
+
+    def mean(*changes: str) -> float:
+        random = np.random.default_rng(3)
+        outcome = simulate_command(CATCH, load, random, replicas=300, stages=2, changes=changes)
+        return float(outcome.data["time"][0])
+
+    assert mean("runs=2") == pytest.approx(2 * mean("runs=1"), rel=0.1)
