@@ -51,6 +51,15 @@ def floor_plan(scores: Sequence[Mapping[str, Any]], names: Sequence[str] = (), *
     return "\n".join([*parts, "</svg>"])
 
 
+def pictures(result: Mapping[str, Any]) -> dict[str, str]:
+    """Pictures for the report of a run, SVG by title, from its result (a score and what else the result holds); empty before
+    a score was given."""
+    if "track" not in result or not result.get("path"):
+        return {}
+    seconds = max(4.0, min(30.0, float(result["path"][-1][0]) / 4.0))
+    return {"Floor plan": floor_plan([result]), "The run from above": floor_plan([result], seconds=seconds)}
+
+
 def _title(score: Mapping[str, Any]) -> str:
     return f"Floor plan: track of seed {score['seed']}, {score['regime']}, {score['length_m']:g} m"
 

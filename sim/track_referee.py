@@ -181,13 +181,15 @@ class Referee:
         overrun = any(each["kind"] == "not_stopped" for each in self.penalties)
         stopped_at_t = self.stopped is not None and not overrun
         duration = (now if self.stopped is None else self.stopped) - begun
+        penalties = self._all_penalties(now, stopped_at_t, overrun)
         return {
             "seed": self.seed,
             "regime": self.regime,
             "finished": self.finished,
             "stopped_at_T": stopped_at_t,
             "time_s": round(duration, 3),
-            "penalties": self._all_penalties(now, stopped_at_t, overrun),
+            "penalties": penalties,
+            "penalty_count": len(penalties),
             "rms_mm": round(1000.0 * math.sqrt(self._squares / self._off), 3) if self._off else None,
             "max_mm": round(1000.0 * self._most, 3) if self._off else None,
             "interruptions": len(self._crossings),

@@ -16,7 +16,7 @@ import pytest
 
 from sim.track import Track
 from sim.track_film import FilmError, View, film, images, main
-from sim.track_plan import floor_plan, summary
+from sim.track_plan import floor_plan, pictures, summary
 
 ROVER_FILE = Path(__file__).parents[3] / "services" / "mobile" / "rover.toml"
 SVG = "{http://www.w3.org/2000/svg}"
@@ -76,6 +76,13 @@ def test_an_animated_plan_goes_past_every_row_of_the_path(score: dict[str, Any])
         assert times[0] == 0.0
         assert times[-1] == 1.0
         assert len(times) == len((move.get("values") or "").split(";")) == len(score["path"])
+
+
+def test_the_report_gets_a_plan_and_a_film(score: dict[str, Any]) -> None:
+    made = pictures({"task": "follow_track", **score})
+    assert [("animateTransform" in svg) for svg in made.values()] == [False, True]
+    assert all(ElementTree.fromstring(svg).tag == f"{SVG}svg" for svg in made.values())
+    assert pictures({"task": "follow_track", "status": "ERROR"}) == {}
 
 
 def test_a_plan_needs_a_run() -> None:
