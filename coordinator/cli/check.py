@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import argparse
+import asyncio
 import time
 from typing import TYPE_CHECKING
 
 from coordinator.cli.loading import add_services_argument, load_directory, load_task, services_path, write_json
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from coordinator.analysis.report import Analysis
     from coordinator.check import Report
     from coordinator.task import Task
 
 EXAMPLE = "petrobot check catch_ball"
+PATIENCE = 2.0
+"""Seconds that a node has to answer."""
 MOST_STATES, LONGEST, MOST_MEMORY = 200_000, 5.0, 500_000_000
 """Markings, seconds and bytes that this quick gate spends on the state space."""
 
@@ -22,11 +27,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument("task", help="a task file, or the name of a task that comes with petrobot")
     add_services_argument(parser)
+    parser.add_argument(
+        "--live", action="store_true", help="ask the nodes too: is each one up, does it offer what it should"
+    )
     parser.add_argument("--json", metavar="FILE", help="write the findings as JSON (- for standard output)")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Check; 0 when the task may run, 2 when it may not."""
+    """Check; 0 when the task may run, 2 when it may not, 3 when only a node that it needs is missing."""
     from coordinator.check import check
 
     task = load_task(options.task)
@@ -35,14 +43,43 @@ def run(options: argparse.Namespace) -> int:
         directory = load_directory(options.services)
         offers = {action: directory.where(action) for action in directory.actions}
     report = check(task, offers)
+    missing = _missing(task, options.services) if options.live else []
     analysis = None if report.errors else _analysed(task)
     ok = report.ok and (analysis is None or not _stuck(analysis))
+    live = {"live": missing} if options.live else {}
     if options.json:
         found = {} if analysis is None else {"analysis": analysis.to_json(structure=False)}
-        write_json(options.json, {"task": task.name, "ok": ok, "findings": _plain(report), **found})
+        write_json(options.json, {"task": task.name, "ok": ok, "findings": _plain(report), **found, **live})
     if options.json != "-":
-        print(_text(task.name, report, analysis, ok))
-    return 0 if ok else 2
+        print(
+            "\n".join(
+                [*(f"missing {line}" for line in missing), _text(task.name, report, analysis, ok and not missing)]
+            )
+        )
+    return 2 if not ok else 3 if missing else 0
+
+
+def _missing(task: Task, services: Path | None) -> list[str]:
+    """What the task needs and the nodes do not give now: a line for each node that is away or offers less than it should."""
+    from coordinator.asking import ask_all
+
+    directory = load_directory(services)
+    used = {a for p in task.flat.places.values() if p.task for a in task.primitive_task_of(p.name).alternatives}
+    wanted: dict[str, set[str]] = {}
+    for action in used & set(directory.actions):
+        wanted.setdefault(directory.where(action), set()).add(action)
+    told = asyncio.run(ask_all(directory, PATIENCE))
+    lines = []
+    for node, actions in sorted(wanted.items()):
+        lacks = sorted(actions - set(told[node].get("offers", ())))
+        if not told[node]["up"]:
+            why = told[node].get("why") or "launch it with `petrobot up`"
+            lines.append(f"{node} at {told[node]['address']} is away ({why}): {', '.join(lacks)}")
+        elif lacks:
+            lines.append(
+                f"{node} at {told[node]['address']} does not offer {', '.join(lacks)}: is its services.toml the same?"
+            )
+    return lines
 
 
 def _analysed(task: Task) -> Analysis:
@@ -71,7 +108,8 @@ def _text(name: str, report: Report, analysis: Analysis | None, ok: bool) -> str
     ]
     if analysis is not None:
         verdicts = {True: "yes", False: "NO", None: "unknown"}
-        told = [f"{key.replace('_', ' ')} {verdicts[v.holds]}" for key, v in analysis.verdicts().items()]
+        shown = {k: v for k, v in analysis.verdicts().items() if k != "safe"}  # runs to do are several tokens
+        told = [f"{key.replace('_', ' ')} {verdicts[v.holds]}" for key, v in shown.items()]
         searched = (
             ""
             if analysis.qualitative.space.complete

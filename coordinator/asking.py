@@ -1,0 +1,49 @@
+"""Asks the nodes of services.toml whether they are up, what they offer and how their devices are."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+from typing import Any
+
+from coordinator.realtime import credentials_of
+from services.comm.caller import Caller
+from services.comm.client import Client
+from services.comm.directory import Directory
+from services.comm.messages import Command, Hello
+from services.comm.notice import Answered, Notice, PeerLost
+from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
+
+
+async def ask_all(directory: Directory, timeout: float) -> dict[str, Any]:
+    """What each node answers within `timeout` s: address, whether it is up, what it offers, its status; else why not."""
+    asked = await asyncio.gather(*(_ask(directory, node, timeout) for node in directory.nodes))
+    return dict(zip(directory.nodes, asked, strict=True))
+
+
+async def _ask(directory: Directory, node: str, timeout: float) -> dict[str, Any]:
+    entry, name = directory.nodes[node], f"asking-{secrets.token_hex(4)}"
+    caller = Caller(node, Hello(OLDEST_VERSION, NEWEST_VERSION, "client", name, name, 0, directory.hash), auto_ack=True)
+    told: asyncio.Future[dict[str, Any]] = asyncio.get_running_loop().create_future()
+    refused: list[str] = []
+
+    def hear(_: float, notices: list[Notice]) -> None:
+        for notice in notices:
+            if isinstance(notice, Answered) and not told.done():
+                told.set_result(dict(notice.answer.data))
+            elif isinstance(notice, PeerLost):
+                refused.append(notice.reason)
+
+    proves = credentials_of(directory)
+    client = Client(entry.host, entry.port, caller, on_notices=hear, key=proves.key, tls=proves.client())
+    client.start()
+    answer: dict[str, Any] = {"address": f"{entry.host}:{entry.port}", "up": await client.connected(timeout)}
+    if answer["up"]:
+        caller.command(client.now(), Command(f"{name}/status", "status"))
+        client.flush()
+        status = await asyncio.wait_for(told, timeout)
+        answer |= {"offers": list(caller.offers), "boot": caller.boot, "version": NEWEST_VERSION, "status": status}
+    elif refused:
+        answer["why"] = refused[-1]
+    await client.close()
+    return answer
