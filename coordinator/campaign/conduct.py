@@ -9,12 +9,22 @@ import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol
 
 from coordinator.campaign.block import PLOTS, Bench
-from coordinator.campaign.plan import Block, CampaignError, Plan, differences, read_manifest, write_manifest
+from coordinator.campaign.observed import write_estimates
+from coordinator.campaign.plan import (
+    Block,
+    CampaignError,
+    Plan,
+    differences,
+    identity,
+    read_manifest,
+    write_manifest,
+)
 from coordinator.campaign.policies import Policy, policy_of
 from coordinator.campaign.rows import Row, rows_of
 from coordinator.campaign.table import TABLE, Table
@@ -22,7 +32,7 @@ from coordinator.campaign.table import TABLE, Table
 TIMES = "times.csv"
 TIME_COLUMNS = ("block", "worker", "cpu_s", "wall_s", "mission_s")
 SESSIONS = "sessions.csv"
-SESSION_COLUMNS = ("workers", "wall_s", "blocks", "lost")
+SESSION_COLUMNS = ("began_at", "workers", "wall_s", "blocks", "lost")
 AHEAD = 3
 """Blocks handed out beyond those that the workers are busy with, so that none waits while a slow one is awaited."""
 
@@ -86,7 +96,8 @@ class Campaign:
         """Do what is left. Interrupted at any point, the next `run` in the same folder goes on. Raises CampaignError."""
         blocks = self.plan.blocks
         done = self.table.recover(blocks)
-        began, self._began = time.monotonic(), time.monotonic()
+        at, began = datetime.now(UTC).isoformat(timespec="seconds"), time.monotonic()
+        self._began = began
         self._already = self._throws = sum(block.count for block in blocks[:done])
         try:
             if self.policy.learns:
@@ -97,7 +108,8 @@ class Campaign:
         finally:
             now = time.monotonic() - began
             done_now = len(self._times_since(done))
-            _append(self.folder / SESSIONS, SESSION_COLUMNS, [[pool.count, round(now, 3), done_now, pool.lost]])
+            row = [at, pool.count, round(now, 3), done_now, pool.lost]
+            _append(self.folder / SESSIONS, SESSION_COLUMNS, [row])
 
     async def _learn(self, pool: Pool, done: int) -> None:
         """Batch by batch; what had been done before is learned again from the table."""
@@ -110,10 +122,13 @@ class Campaign:
             self.policy.update([*known, *fresh])
 
     def result(self) -> dict[str, Any]:
-        """The result so far, as the command line writes it."""
-        from coordinator.campaign.summary import result_of
+        """The result so far, as the command line writes it; the estimates file is written beside the table."""
+        from coordinator.campaign.summary import Summary, result_of
 
-        return result_of(self.folder, self.plan, self.bench.task, self.table.rows(), self.policy.state())
+        name = identity(self.plan)
+        summary = Summary.of(self.bench.task, self.table.rows(), name)
+        write_estimates(self.folder, summary.estimates, self.policy.selectors(), f"campaign/{name}")
+        return result_of(self.folder, self.plan, summary, self.policy.state())
 
     async def _results(self, pool: Pool, orders: Iterator[tuple[Block, dict[str, Any]]]) -> AsyncIterator[list[Row]]:
         """The rows of blocks in order; each block's are in the table before they are given."""
@@ -176,3 +191,9 @@ def read_csv(path: Path) -> list[dict[str, str]]:
         return []
     with path.open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
+
+
+def began(folder: Path) -> str | None:
+    """When a campaign's first session began (UTC, ISO 8601); None if it is not known."""
+    sessions = read_csv(folder / SESSIONS)
+    return sessions[0]["began_at"] if sessions else None

@@ -1,21 +1,82 @@
-"""A run of a campaign's table as the estimates and learners take it."""
+"""Rows of a campaign's table as estimates and learners take them, and the estimates file made of them."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from coordinator.campaign.rows import Row
 from coordinator.campaign.throws import RunEntry
-from coordinator.learning.estimate import Observation
+from coordinator.estimates_file import EstimatesFile
+from coordinator.learning.estimate import Key, Observation, Tally
+from coordinator.learning.learning import Estimates
+from coordinator.learning.passage import Flow, PassageKey
 from coordinator.task import Executed, Status, Task
+
+ESTIMATES = "estimates.db"
+
+
+def context_of(regime: str) -> str:
+    """A regime as the context of estimates and selectors; as `petrobot run --learn` names it."""
+    return f"regime={regime}" if regime else ""
+
+
+def regime_of(context: str) -> str:
+    """Back from `context_of`."""
+    return context.removeprefix("regime=")
 
 
 def observation(task: Task, run: RunEntry) -> Observation:
     """A run that was preempted and counts none, or had not ended, is censored. CPU time is what services.toml declares."""
     measure = task.primitive_task_of(run.place).cost
+    preempted = run.cancelled and bool(run.taken)
     return Observation(
         Status(run.status) if run.status else None,
-        run.seconds,
+        run.took if preempted else run.seconds,
         run.cause,
         Executed(run.executed),
         run.cost if measure == "cpu" else None,
         run.values,
         run.taken if run.cancelled else None,
+        None if run.cancelled else max(0.0, round(run.took - run.seconds, 6)),
     )
+
+
+def add_row(estimates: Estimates, task: Task, row: Row, salt: str) -> None:
+    """Count a row's runs and firings."""
+    if row.throw is None:
+        return
+    context = context_of(row.regime)
+    for run in row.throw.runs:
+        key = Key(task.primitive_task_of(run.place).name, run.action, context)
+        name = f"{salt}/{row.regime}/{row.seed}/{row.k}"
+        estimates.tallies[key] = estimates.tallies.get(key, Tally()).adding(observation(task, run), name)
+    waits: dict[str, list[float]] = {}
+    for transition, seconds in row.throw.waits:
+        waits.setdefault(transition, []).append(seconds)
+    for transition, count in row.throw.fired.items():
+        where = PassageKey(task.name, transition, context)
+        flow = estimates.flows.get(where, Flow())
+        known = waits.get(transition, [])
+        for i in range(count):
+            flow = flow.adding(known[i] if i < len(known) else None)
+        estimates.flows[where] = flow
+
+
+def estimates_of(task: Task, rows: Iterable[Row], salt: str) -> Estimates:
+    """The estimates of a whole table. `salt` names the campaign."""
+    made = Estimates()
+    for row in rows:
+        add_row(made, task, row, salt)
+    return made
+
+
+def write_estimates(
+    folder: Path, estimates: Estimates, selectors: Mapping[str, Mapping[str, Any]], origin: str
+) -> Path:
+    """Write the campaign's estimates file anew; its origin is the campaign's own, so merging it twice counts nothing twice."""
+    path = folder / ESTIMATES
+    path.unlink(missing_ok=True)
+    EstimatesFile(path, origin).add(estimates, selectors)
+    return path

@@ -142,3 +142,11 @@ def differences(old: Plan, new: Plan) -> list[str]:
     before, after = old.to_plain(), new.to_plain()
     same_file = {key for key in ("task", "services", "mock") if old.digests.get(key) == new.digests.get(key)}
     return [key for key in before if key not in same_file and before[key] != after.get(key)]
+
+
+def identity(plan: Plan) -> str:
+    """A short name of what a campaign runs, the same wherever its files lie: throws of equal identity are the same throws."""
+    data = plan.to_plain()
+    for key in ("task", "services", "mock"):
+        data[key] = plan.digests.get(key, "")
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]

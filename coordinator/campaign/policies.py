@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from coordinator.campaign.block import Weights
-from coordinator.campaign.observed import observation
+from coordinator.campaign.observed import context_of, observation, regime_of
 from coordinator.campaign.plan import Block, CampaignError, Plan
 from coordinator.campaign.rows import Row
 from coordinator.learning.learning import Learning
@@ -39,6 +39,9 @@ class Policy(Protocol):
 
     def state(self) -> dict[str, Any]:
         """What it knows, as plain data for the result."""
+
+    def selectors(self) -> dict[str, dict[str, Any]]:
+        """States of selectors for the estimates file, by primitive task."""
 
 
 def offered(task: Task, directory: Directory) -> dict[str, tuple[str, ...]]:
@@ -80,6 +83,10 @@ class Fixed:
         """The actions."""
         return {task: next(iter(actions)) for task, actions in self._weights.items()}
 
+    def selectors(self) -> dict[str, dict[str, Any]]:
+        """None."""
+        return {}
+
 
 class RoundRobin:
     """All combinations of alternatives in turn (of those not chosen by hand), from throw to throw of a regime."""
@@ -108,6 +115,10 @@ class RoundRobin:
     def state(self) -> dict[str, Any]:
         """The alternatives."""
         return dict(self._alternatives)
+
+    def selectors(self) -> dict[str, dict[str, Any]]:
+        """None."""
+        return {}
 
 
 class Random(RoundRobin):
@@ -150,13 +161,13 @@ class Learned:
         return [{**self._fixed, **self._choices(block, k)} for k in range(block.count)]
 
     def _choices(self, block: Block, k: int) -> dict[str, dict[str, float]]:
-        out = {}
+        out, context = {}, context_of(block.regime)
         for name in self._learning.selectors:
             if name in self._chosen:
                 continue
             random = np.random.default_rng([block.seed, k, *name.encode()])
-            action, _ = self._learning.choose(name, block.regime, self._alternatives[name], random)
-            self._learning.apply(Choice(name, action, block.regime))
+            action, _ = self._learning.choose(name, context, self._alternatives[name], random)
+            self._learning.apply(Choice(name, action, context))
             out[name] = {action: 1.0}
         return out
 
@@ -167,20 +178,25 @@ class Learned:
         self._learning.restore(self._before or {})
         self._before = None
         for row in rows:
+            context = context_of(row.regime)
             for run in row.throw.runs if row.throw is not None else ():
                 name = self._task.primitive_task_of(run.place).name
-                self._learning.apply(Choice(name, run.action, row.regime))
-                self._learning.apply(End(name, run.action, row.regime, observation(self._task, run)))
+                self._learning.apply(Choice(name, run.action, context))
+                self._learning.apply(End(name, run.action, context, observation(self._task, run)))
 
     def state(self) -> dict[str, Any]:
         """By regime and primitive task: learned probabilities, J from the learner's sums, and the best action."""
-        regimes = sorted({regime for s in self._learning.selectors.values() for regime in s.learners})
-        return {regime: {n: self._of(n, regime) for n in self._learning.selectors} for regime in regimes}
+        contexts = sorted({c for s in self._learning.selectors.values() for c in s.learners})
+        return {regime_of(c): {n: self._of(n, c) for n in self._learning.selectors} for c in contexts}
 
-    def _of(self, name: str, regime: str) -> dict[str, Any]:
+    def selectors(self) -> dict[str, dict[str, Any]]:
+        """The learners' states: `petrobot run --learn` goes on from them."""
+        return self._learning.state()
+
+    def _of(self, name: str, context: str) -> dict[str, Any]:
         selector = self._learning.selectors[name]
-        p = selector.learned(regime)
-        j = {a: (round(v, 6) if np.isfinite(v) else None) for a, v in selector.objective(regime).items()}
+        p = selector.learned(context)
+        j = {a: (round(v, 6) if np.isfinite(v) else None) for a, v in selector.objective(context).items()}
         return {"best": max(p, key=lambda a: p[a]), "p": {a: round(v, 6) for a, v in p.items()}, "J": j}
 
 

@@ -29,8 +29,8 @@ GENERAL = (
 """`n` of the campaign, `k` of the mission run with `seed`; `time`: s that the throw took; `at`: s since the mission began."""
 BY_PLACE = ("status", "cause", "seconds", "cost")
 """Of the throw's first run in a place; all runs stand in the column `runs`."""
-LAST = ("more", "runs", "waits")
-"""JSON: results of the task's own that the first block did not have; RunEntry.to_plain of each run; Throw.waits."""
+LAST = ("more", "runs", "waits", "fired")
+"""JSON: results of the task's own that the first block did not have; RunEntry.to_plain of each run; Throw.waits, Throw.fired."""
 
 Cell = str | int | float | None
 
@@ -89,7 +89,12 @@ def _general(row: Row) -> dict[str, Any]:
     throw = row.throw
     if throw is None:
         return {**base, "begun": False}
-    own = {"begun": True, "at": throw.begun, "waits": _json([list(w) for w in throw.waits])}
+    own = {
+        "begun": True,
+        "at": throw.begun,
+        "waits": _json([list(w) for w in throw.waits]),
+        "fired": _json(throw.fired),
+    }
     own |= {name: getattr(throw, name) for name in ("status", "cause", "completed", "goals", "time")}
     return {**base, **own, "runs": _json([run.to_plain() for run in throw.runs])}
 
@@ -132,6 +137,7 @@ def read_row(record: Mapping[str, str]) -> Row:
             record["cause"],
             [RunEntry.from_plain(run) for run in json.loads(record["runs"])],
             [(str(name), float(wait)) for name, wait in json.loads(record["waits"])],
+            json.loads(record["fired"]),
         )
     own = {key: value_of(text) for key, text in record.items() if _is_own(key) and text != ""}
     own |= json.loads(record["more"]) if record.get("more") else {}

@@ -11,17 +11,15 @@ from typing import Any
 import numpy as np
 
 from coordinator.campaign.conduct import SESSIONS, TIMES, read_csv
-from coordinator.campaign.observed import observation
+from coordinator.campaign.observed import ESTIMATES, add_row, context_of
 from coordinator.campaign.plan import Plan
 from coordinator.campaign.rows import Row
 from coordinator.campaign.table import TABLE
-from coordinator.learning.estimate import Key, Tally, merge
+from coordinator.learning.estimate import Key, Tally
 from coordinator.learning.intervals import wilson
+from coordinator.learning.learning import Estimates
 from coordinator.learning.objective import Comparison, Question, compare
 from coordinator.task import Task
-
-Tallies = dict[Key, Tally]
-SALT = "campaign"
 
 
 @dataclass
@@ -70,23 +68,13 @@ def _share(part: int, whole: int) -> float | None:
     return round(part / whole, 6) if whole else None
 
 
-def tallies_of(task: Task, rows: Iterable[Row], salt: str = SALT) -> Tallies:
-    """The estimates of all runs in these rows, by primitive task, action and regime."""
-    out: Tallies = {}
-    for row in rows:
-        for run in row.throw.runs if row.throw is not None else ():
-            key = Key(task.primitive_task_of(run.place).name, run.action, row.regime)
-            out[key] = out.get(key, Tally()).adding(observation(task, run), f"{salt}/{row.seed}/{row.k}")
-    return dict(sorted(out.items()))
-
-
 def comparisons(task: Task, tallies: Mapping[Key, Tally], regime: str | None = None) -> dict[str, Comparison]:
     """By primitive task: all its alternatives with runs judged together, over all regimes or in one."""
     out = {}
     for primitive in task.primitive_tasks.values():
         by_action: dict[str, dict[str, Tally]] = {}
         for key, tally in tallies.items():
-            if key.primitive_task == primitive.name and regime in (None, key.context):
+            if key.primitive_task == primitive.name and (regime is None or key.context == context_of(regime)):
                 by_action.setdefault(key.action, {})[key.context] = tally
         if by_action:
             ordered = {a: by_action[a] for a in primitive.alternatives if a in by_action}
@@ -102,13 +90,14 @@ class Summary:
     whole: Counts = field(default_factory=Counts)
     by_regime: dict[str, Counts] = field(default_factory=dict)
     chosen: dict[str, dict[str, int]] = field(default_factory=dict)
-    tallies: Tallies = field(default_factory=dict)
+    estimates: Estimates = field(default_factory=Estimates)
+    salt: str = ""
     mission_s: dict[int, float] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, task: Task, rows: Iterable[Row]) -> Summary:
-        """Of a table's rows."""
-        made = cls(task)
+    def of(cls, task: Task, rows: Iterable[Row], salt: str = "") -> Summary:
+        """Of a table's rows. `salt` names the campaign in the estimates."""
+        made = cls(task, salt=salt)
         for row in rows:
             made.add(row)
         return made
@@ -122,12 +111,11 @@ class Summary:
             primitive = self.task.primitive_task_of(run.place).name
             actions = self.chosen.setdefault(primitive, {})
             actions[run.action] = actions.get(run.action, 0) + 1
-        for key, tally in tallies_of(self.task, [row]).items():
-            self.tallies[key] = merge(self.tallies.get(key, Tally()), tally)
+        add_row(self.estimates, self.task, row, self.salt)
 
     def objectives(self) -> dict[str, dict[str, float | None]]:
         """J of each action, one rho for each primitive task."""
-        found = comparisons(self.task, self.tallies)
+        found = comparisons(self.task, self.estimates.tallies)
         return {task: {f.action: _finite(f.j) for f in judged.figures} for task, judged in found.items()}
 
     def to_plain(self) -> dict[str, Any]:
@@ -142,9 +130,9 @@ class Summary:
         }
 
 
-def result_of(folder: Path, plan: Plan, task: Task, rows: Iterable[Row], policy: Mapping[str, Any]) -> dict[str, Any]:
+def result_of(folder: Path, plan: Plan, made: Summary, policy: Mapping[str, Any]) -> dict[str, Any]:
     """The result of a campaign as the command line writes it."""
-    summary = Summary.of(task, rows).to_plain()
+    summary, task = made.to_plain(), made.task
     sessions, times = read_csv(folder / SESSIONS), read_csv(folder / TIMES)
     wall = sum(float(s["wall_s"]) for s in sessions)
     core_s = sum(float(s["wall_s"]) * int(s["workers"]) for s in sessions)
@@ -157,6 +145,7 @@ def result_of(folder: Path, plan: Plan, task: Task, rows: Iterable[Row], policy:
         "selector": plan.selector,
         "workers": int(sessions[-1]["workers"]) if sessions else 0,
         "rows": str(folder / TABLE),
+        "estimates": str(folder / ESTIMATES),
         **summary,
         "runs": plan.runs,
         "begun": summary["runs"],

@@ -79,6 +79,9 @@ class Throw:
     waits: list[tuple[str, float]] = field(default_factory=list)
     """(transition, s) for each firing of a transition that waited for an event or a timer, from when it could have fired."""
 
+    fired: dict[str, int] = field(default_factory=dict)
+    """How often each transition fired."""
+
     @property
     def all_success(self) -> bool:
         """Every run ended with SUCCESS: what R_conj counts."""
@@ -169,6 +172,7 @@ class ThrowLog:
             return
         throw = self.throws[-1]
         throw.goals += fired.transition in self._goals
+        throw.fired[fired.transition] = throw.fired.get(fired.transition, 0) + 1
         if fired.transition in self._waiting:
             since = max((self._since[place] for place, _ in self._waiting[fired.transition]), default=now)
             throw.waits.append((fired.transition, round(now - since, DIGITS)))

@@ -87,14 +87,33 @@ def run(options: argparse.Namespace) -> int:
         finally:
             shown.close()
         result = campaign.result()
+        check = None if options.check is None else _checked(options.check, folder)
     except CampaignError as fault:
         raise CommandError(2, str(fault)) from fault
     write_json(str(folder / "result.json"), result)
     if options.json:
-        write_json(options.json, result)
+        write_json(options.json, result if check is None else {**result, "check": check})
     if options.json != "-":
         print(text_of(result))
-    return 0
+        _print_check(check)
+    return 0 if check is None or check["agrees"] else 1
+
+
+def _checked(forecast: Path, folder: Path) -> dict[str, Any]:
+    from coordinator.cli.forecast import compared
+    from coordinator.forecast.registered import ForecastError
+
+    try:
+        return compared(forecast, folder)
+    except ForecastError as fault:
+        raise CommandError(2, str(fault)) from fault
+
+
+def _print_check(check: dict[str, Any] | None) -> None:
+    if check is not None:
+        from coordinator.forecast.tables import agreement_text
+
+        print(agreement_text(check))
 
 
 async def _conduct(campaign: Campaign, options: argparse.Namespace) -> None:

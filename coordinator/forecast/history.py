@@ -1,0 +1,177 @@
+"""Runs of a campaign as arrays: what each came to, how long it took, and what had ended before it in its throw."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coordinator.campaign.rows import Row
+from coordinator.campaign.throws import RunEntry, Throw
+from coordinator.task import Kind, Status, Task
+
+Codes = NDArray[np.int64]
+Values = NDArray[np.float64]
+
+CENSORED = -1
+"""Status code of a run that was preempted and counts none."""
+NONE = 0
+"""Outcome and action code of a place where no run has ended in this throw yet."""
+STATUSES = tuple(Status)
+
+
+@dataclass(frozen=True)
+class Vocabulary:
+    """Numbers for names: action places, transitions and actions of a flat task."""
+
+    places: tuple[str, ...]
+    transitions: tuple[str, ...]
+    actions: tuple[str, ...]
+
+    @classmethod
+    def of(cls, task: Task) -> Vocabulary:
+        """Of a task."""
+        flat = task.flat
+        actions = dict.fromkeys(a for p in flat.primitive_tasks.values() for a in p.alternatives)
+        places = tuple(p.name for p in flat.places.values() if p.kind is Kind.ACTION)
+        return cls(places, tuple(flat.transitions), tuple(actions))
+
+    def outcome(self, status: int, taken: int) -> int:
+        """One code, above 0, for a status code and the transition that took the token (-1: none did)."""
+        return 1 + (status + 1) * (len(self.transitions) + 1) + taken + 1
+
+    def parts(self, outcome: Codes) -> tuple[Codes, Codes]:
+        """Status codes and transitions behind outcome codes above 0."""
+        status, taken = np.divmod(outcome - 1, len(self.transitions) + 1)
+        return status - 1, taken - 1
+
+
+@dataclass(frozen=True)
+class Runs:
+    """All runs of some throws. `n` runs, `q` action places."""
+
+    place: Codes
+    action: Codes
+    """Code of the action, above 0."""
+    outcome: Codes
+    preempted: NDArray[np.bool_]
+    """A transition took its token while it went on."""
+    censored: NDArray[np.bool_]
+    """It was preempted and counts none."""
+    took: Values
+    """s from the token's coming to its end."""
+    throw: Codes
+    """Index of its throw."""
+    weight: Values
+    seen_outcome: Codes
+    """(q, n): outcome of the latest run that had ended in each place of its throw when it began; NONE without any."""
+    seen_action: Codes
+    seen_took: Values
+    """nan without any."""
+
+    def of(self, which: NDArray[np.bool_] | Codes) -> Runs:
+        """Some of them."""
+        return Runs(
+            self.place[which],
+            self.action[which],
+            self.outcome[which],
+            self.preempted[which],
+            self.censored[which],
+            self.took[which],
+            self.throw[which],
+            self.weight[which],
+            self.seen_outcome[:, which],
+            self.seen_action[:, which],
+            self.seen_took[:, which],
+        )
+
+    def __len__(self) -> int:
+        return len(self.place)
+
+
+@dataclass(frozen=True)
+class Training:
+    """What a regime's throws are known to be."""
+
+    task: Task
+    vocabulary: Vocabulary
+    throws: tuple[Throw, ...]
+    runs: Runs
+    waits: dict[str, tuple[Values, Codes]]
+    """By waiting transition: seconds of each firing, and the throw that it belongs to."""
+
+    @classmethod
+    def of(cls, task: Task, throws: Iterable[Throw]) -> Training:
+        """Of throws. Raises ValueError without any."""
+        kept, vocabulary = tuple(throws), Vocabulary.of(task)
+        if not kept:
+            raise ValueError("no throw to learn from")
+        waits: dict[str, list[tuple[float, int]]] = {}
+        for i, throw in enumerate(kept):
+            for name, seconds in throw.waits:
+                waits.setdefault(name, []).append((seconds, i))
+        return cls(
+            task,
+            vocabulary,
+            kept,
+            _runs(vocabulary, kept),
+            {name: (np.array([s for s, _ in w]), np.array([i for _, i in w])) for name, w in waits.items()},
+        )
+
+
+def by_regime(task: Task, rows: Iterable[Row]) -> dict[str, Training]:
+    """The training of each regime of a table."""
+    throws: dict[str, list[Throw]] = {}
+    for row in rows:
+        if row.throw is not None:
+            throws.setdefault(row.regime, []).append(row.throw)
+    return {regime: Training.of(task, kept) for regime, kept in throws.items()}
+
+
+def _runs(vocabulary: Vocabulary, throws: tuple[Throw, ...]) -> Runs:
+    places = {name: i for i, name in enumerate(vocabulary.places)}
+    actions = {name: i + 1 for i, name in enumerate(vocabulary.actions)}
+    flat = [(i, run) for i, throw in enumerate(throws) for run in throw.runs if run.place in places]
+    codes = [_outcome(vocabulary, run) for _, run in flat]
+    n, q = len(flat), len(places)
+    seen_outcome, seen_action = np.zeros((q, n), np.int64), np.zeros((q, n), np.int64)
+    seen_took = np.full((q, n), np.nan)
+    begin = 0
+    while begin < n:
+        end = begin
+        while end < n and flat[end][0] == flat[begin][0]:
+            end += 1
+        for j in range(begin, end):
+            for i in _ended_before(flat, j, begin, end):
+                p = places[flat[i][1].place]
+                seen_outcome[p, j], seen_action[p, j] = codes[i], actions.get(flat[i][1].action, 0)
+                seen_took[p, j] = flat[i][1].took
+        begin = end
+    return Runs(
+        np.array([places[run.place] for _, run in flat], np.int64),
+        np.array([actions.get(run.action, 0) for _, run in flat], np.int64),
+        np.array(codes, np.int64),
+        np.array([run.cancelled for _, run in flat], np.bool_),
+        np.array([not run.status for _, run in flat], np.bool_),
+        np.array([run.took for _, run in flat]),
+        np.array([i for i, _ in flat], np.int64),
+        np.ones(n),
+        seen_outcome,
+        seen_action,
+        seen_took,
+    )
+
+
+def _ended_before(flat: list[tuple[int, RunEntry]], j: int, begin: int, end: int) -> list[int]:
+    """Runs of the same throw that had ended when run j began, in the order of their ends."""
+    came = flat[j][1].begun
+    over = [i for i in range(begin, end) if i != j and flat[i][1].begun + flat[i][1].took <= came + 1e-9]
+    return sorted((i for i in over if i < j), key=lambda i: flat[i][1].begun + flat[i][1].took)
+
+
+def _outcome(vocabulary: Vocabulary, run: RunEntry) -> int:
+    status = STATUSES.index(Status(run.status)) if run.status else CENSORED
+    taken = vocabulary.transitions.index(run.taken) if run.taken in vocabulary.transitions else -1
+    return vocabulary.outcome(status, taken)

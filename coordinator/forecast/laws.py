@@ -1,0 +1,278 @@
+"""Laws of runs: empirical competing risks of (outcome, duration) in contexts that chi-square tests tell apart.
+
+Contexts are grown as in CHAID (G. V. Kass, Applied Statistics 29 (1980) 119-127): the factor on which the response depends most
+significantly splits the runs, again and again, until no test rejects independence. Factors are what had ended before in the same
+throw: in each action place the outcome, the action and the duration of the latest run. First the outcome is unfolded so, then,
+for each outcome of each of these contexts, the duration: so a strong dependence among durations never hides one among outcomes.
+Within a context a duration keeps its linear trend with an earlier one.
+Censored runs pass their weight on to later ends (B. Efron's redistribution to the right, 1967): the Aalen-Johansen estimate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2_contingency
+
+from coordinator.forecast.history import CENSORED, Codes, Runs, Training, Values, Vocabulary
+
+ALPHA = 0.01
+"""Level at which dependence counts, over all factors of a node (Bonferroni)."""
+LEAST = 30
+"""Runs in a context at least."""
+DEEPEST = 6
+SURE = 3.0
+"""Standard errors beyond which a trend within a context counts."""
+GROUPS = 6
+"""Classes of an earlier duration at most, where durations are told apart by it; half of them for outcomes."""
+
+
+@dataclass(frozen=True)
+class Law:
+    """Ends that were seen in one context. Arrays over its members."""
+
+    outcome: Codes
+    preempted: np.ndarray
+    took: Values
+    weight: Values
+    throw: Codes
+    trend: Trend | None = None
+    """Durations only: how they go with an earlier one, within this context."""
+
+
+@dataclass(frozen=True)
+class Trend:
+    """A duration that changes by `slope` s for each s of the latest run in `place`; `earlier` is that of each member (s)."""
+
+    place: int
+    slope: float
+    earlier: Values
+
+
+@dataclass(frozen=True)
+class Split:
+    """What tells the contexts below a node apart."""
+
+    kind: str
+    """outcome, action or took."""
+    place: int
+    edges: tuple[float, ...] = ()
+    """took: where its classes end (s)."""
+    missing: bool = False
+    """took: the first child is for throws in which no such run had ended."""
+    groups: Mapping[int, int] = field(default_factory=dict)
+    """outcome, action: child of each code; any other code has the last child."""
+    p_value: float = 1.0
+
+    def child(self, outcome: Codes, action: Codes, took: Values, count: int) -> Codes:
+        """Child of each column, from what was seen in all places (arrays (q, n))."""
+        if self.kind == "took":
+            seconds = took[self.place]
+            group = np.searchsorted(np.array(self.edges), np.nan_to_num(seconds), side="right")
+            return np.where(np.isnan(seconds), 0, group + self.missing)
+        codes = (outcome if self.kind == "outcome" else action)[self.place]
+        out = np.full(len(codes), count - 1)
+        for code, group in self.groups.items():
+            out[codes == code] = group
+        return out
+
+
+@dataclass
+class Context:
+    """A node of the tree: a law, and a split with children unless it is a leaf."""
+
+    law: Law
+    number: int
+    split: Split | None = None
+    children: list[Context] = field(default_factory=list)
+    durations: dict[int, Context] = field(default_factory=dict)
+    """In a leaf of an outcome tree: the tree of the durations of each outcome."""
+
+    def leaves(self) -> list[Context]:
+        """All contexts that no test splits further."""
+        return [leaf for child in self.children for leaf in child.leaves()] if self.children else [self]
+
+
+class Laws:
+    """Laws of all actions of one regime: `contexts[(place code, action code)]`."""
+
+    def __init__(self, training: Training, *, unfold: bool = True) -> None:
+        self.vocabulary = training.vocabulary
+        self.contexts: dict[tuple[int, int], Context] = {}
+        self._numbers = 0
+        runs = training.runs
+        for key in sorted(set(zip(runs.place.tolist(), runs.action.tolist(), strict=True))):
+            own = runs.of((runs.place == key[0]) & (runs.action == key[1]))
+            self.contexts[key] = self._grow(own, DEEPEST if unfold else 0, outcomes=True)
+
+    @property
+    def count(self) -> int:
+        """Nodes of all trees."""
+        return self._numbers
+
+    def _grow(self, runs: Runs, deepest: int, *, outcomes: bool) -> Context:
+        ended = with_weights(runs) if outcomes else runs
+        context = Context(_law(ended, trend=not outcomes and bool(deepest)), self._numbers)
+        self._numbers += 1
+        found = best_split(runs, outcomes=outcomes) if deepest and len(runs) >= 2 * LEAST else None
+        if found is not None:
+            context.split, child = found
+            parts = [runs.of(child == c) for c in range(int(child.max()) + 1)]
+            context.children = [self._grow(part, deepest - 1, outcomes=outcomes) for part in parts]
+        elif outcomes:
+            deepest = DEEPEST if deepest else 0
+            for code in np.unique(ended.outcome):
+                context.durations[int(code)] = self._grow(ended.of(ended.outcome == code), deepest, outcomes=False)
+        return context
+
+    def splits(self) -> list[dict[str, Any]]:
+        """What was told apart, for people: place, action, by what, how many contexts, p-value."""
+        names, out = self.vocabulary, []
+        for (place, action), top in self.contexts.items():
+            stack, outcomes = [top], {top.number}
+            while stack:
+                node = stack.pop()
+                if node.number in outcomes:
+                    outcomes |= {child.number for child in node.children}
+                if node.split is not None:
+                    out.append(
+                        {
+                            "place": names.places[place],
+                            "action": names.actions[action - 1],
+                            "of": "outcome" if node.number in outcomes else "duration",
+                            "by": f"{node.split.kind} of {names.places[node.split.place]}",
+                            "contexts": len(node.children),
+                            "runs": len(node.law.took),
+                            "p": node.split.p_value,
+                        }
+                    )
+                stack += [*node.children, *node.durations.values()]
+        return out
+
+
+def with_weights(runs: Runs) -> Runs:
+    """The runs that ended, with weights that sum to 1: censored ones give theirs to those that lasted longer (else to all)."""
+    ordered = runs.of(np.argsort(runs.took, kind="stable"))
+    weight, ended = np.full(len(runs), 1.0 / max(1, len(runs))), ~ordered.censored
+    for i in np.flatnonzero(ordered.censored):
+        later = ended & (np.arange(len(runs)) > i)
+        heirs = later if later.any() else ended
+        if heirs.any():
+            weight[heirs] += weight[i] / heirs.sum()
+    return replace(ordered, weight=weight).of(ended)
+
+
+def _law(runs: Runs, *, trend: bool) -> Law:
+    whole = runs.weight.sum()
+    weight = runs.weight / whole if whole else runs.weight
+    return Law(runs.outcome, runs.preempted, runs.took, weight, runs.throw, _trend(runs) if trend else None)
+
+
+def _trend(runs: Runs) -> Trend | None:
+    """The strongest linear dependence on an earlier duration, if it is beyond three standard errors."""
+    best: Trend | None = None
+    strongest, n = SURE, len(runs)
+    for place, earlier in enumerate(runs.seen_took):
+        if n < LEAST // 2 or np.isnan(earlier).any() or earlier.std() == 0 or runs.took.std() == 0:
+            continue
+        slope = float(np.cov(earlier, runs.took)[0, 1] / earlier.var(ddof=1))
+        left = float(np.var(runs.took - slope * earlier)) * n / (n - 2)
+        surety = abs(slope) * float(earlier.std()) * np.sqrt(n / max(left, 1e-18))
+        if surety > strongest:
+            best, strongest = Trend(place, slope, earlier), float(surety)
+    return best
+
+
+def best_split(runs: Runs, *, outcomes: bool) -> tuple[Split, Codes] | None:
+    """The most significant split of runs and the child of each run; None if no test rejects independence."""
+    response = runs.outcome if outcomes else _classes(runs.took)
+    groups = GROUPS // 2 if outcomes else GROUPS
+    candidates: list[tuple[float, Split, Codes]] = []
+    for place in range(len(runs.seen_outcome)):
+        for kind in ("outcome", "action", "took"):
+            made = _by_duration(runs, place, groups) if kind == "took" else _candidate(runs, kind, place)
+            if made is not None:
+                candidates.append((_p_value(made[1], response), *made))
+    if not candidates:
+        return None
+    p, split, child = min(candidates, key=lambda c: c[0])
+    p = min(1.0, p * len(candidates))
+    return (replace(split, p_value=p), child) if p < ALPHA else None
+
+
+def _classes(took: Values) -> Codes:
+    """Durations in four classes of about equal size."""
+    return np.searchsorted(np.quantile(took, (0.25, 0.5, 0.75)), took, side="right")
+
+
+def _candidate(runs: Runs, kind: str, place: int) -> tuple[Split, Codes] | None:
+    codes = (runs.seen_outcome if kind == "outcome" else runs.seen_action)[place]
+    found, counts = np.unique(codes, return_counts=True)
+    large = [int(c) for c, n in zip(found, counts, strict=True) if n >= LEAST]
+    if len(found) - len(large) and len(codes) - counts[counts >= LEAST].sum() < LEAST and large:
+        large.remove(min(large, key=lambda c: int(counts[found == c][0])))  # the rest joins the smallest large class
+    groups = {code: i for i, code in enumerate(large)}
+    rest = bool(len(found) > len(large))
+    if len(groups) + rest < 2:
+        return None
+    split = Split(kind, place, groups=groups)
+    return split, split.child(runs.seen_outcome, runs.seen_action, runs.seen_took, len(groups) + rest)
+
+
+def _by_duration(runs: Runs, place: int, most: int) -> tuple[Split, Codes] | None:
+    seconds = runs.seen_took[place]
+    known = ~np.isnan(seconds)
+    if known.sum() < 2 * LEAST or 0 < (~known).sum() < LEAST:
+        return None
+    groups = int(min(most, known.sum() // LEAST))
+    edges = np.unique(np.quantile(seconds[known], np.arange(1, groups) / groups))
+    missing = not bool(known.all())
+    split = Split("took", place, tuple(float(e) for e in edges), missing)
+    child = split.child(runs.seen_outcome, runs.seen_action, runs.seen_took, 0)
+    counts = np.bincount(child, minlength=len(edges) + 1 + missing)
+    return (split, child) if len(counts) > 1 and counts.min() >= LEAST // 2 else None
+
+
+def _p_value(child: Codes, response: Codes) -> float:
+    """p-value of the chi-square test of independence; 1 where one of them does not vary."""
+    table = crossed(child, response)
+    if min(table.shape) < 2:
+        return 1.0
+    return float(chi2_contingency(table).pvalue)
+
+
+def crossed(one: Codes, other: Codes) -> np.ndarray:
+    """Contingency table of two codes, only of those that occur."""
+    _, a = np.unique(one, return_inverse=True)
+    _, b = np.unique(other, return_inverse=True)
+    table = np.zeros((a.max() + 1, b.max() + 1), np.int64)
+    np.add.at(table, (a, b), 1)
+    return table
+
+
+def dependences(training: Training) -> list[dict[str, Any]]:
+    """Chi-square tests of the statuses of two places within one throw (first runs), the most significant first."""
+    vocabulary, runs = training.vocabulary, training.runs
+    status = first_statuses(vocabulary, runs, len(training.throws))
+    out = []
+    for i, one in enumerate(vocabulary.places):
+        for j in range(i + 1, len(vocabulary.places)):
+            both = (status[i] >= 0) & (status[j] >= 0)
+            table = crossed(status[i][both], status[j][both]) if both.any() else np.zeros((1, 1), np.int64)
+            if min(table.shape) < 2:
+                continue
+            p = float(chi2_contingency(table).pvalue)
+            out.append({"places": [one, vocabulary.places[j]], "throws": int(both.sum()), "p": p})
+    return sorted(out, key=lambda d: float(d["p"]))
+
+
+def first_statuses(vocabulary: Vocabulary, runs: Runs, throws: int) -> Codes:
+    """(q, throws): status code of the first run in each place of each throw; CENSORED - 1 where there is none."""
+    out = np.full((len(vocabulary.places), throws), CENSORED - 1)
+    status, _ = vocabulary.parts(runs.outcome)
+    for i in range(len(runs) - 1, -1, -1):
+        out[runs.place[i], runs.throw[i]] = status[i]
+    return out

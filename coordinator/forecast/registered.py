@@ -1,0 +1,97 @@
+"""Forecast files: written before the runs, with the time, a hash of what they rest on, and a hash of what they say."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from coordinator.analysis.forecast import forecast as solve
+from coordinator.analysis.stochastic import Measured, stochastic_view
+from coordinator.forecast.history import Training
+from coordinator.forecast.predict import Request, predict
+from coordinator.task import Task
+
+SCHEMA = 1
+METHOD = (
+    "Generalised semi-Markov simulation of the net: measured competing risks of each run, in contexts told apart by "
+    "chi-square tests, with their measured durations (no phase-type fit); predictive intervals by a cluster bootstrap over "
+    "training throws, with the noise of the new runs."
+)
+
+
+class ForecastError(Exception):
+    """A forecast file cannot be made or used; the text says why."""
+
+
+def register(
+    task: Task, trainings: Mapping[str, Training], requests: Mapping[str, Request], about: Mapping[str, Any]
+) -> dict[str, Any]:
+    """A forecast of the regimes in `requests`. `about` says what it rests on. Raises ForecastError."""
+    regimes = {}
+    for name, request in requests.items():
+        if name not in trainings:
+            raise ForecastError(f"no throw of regime {name} was measured; there are {', '.join(trainings)}")
+        try:
+            regimes[name] = predict(trainings[name], request) | {"choices": request.choices}
+        except ValueError as fault:
+            raise ForecastError(f"regime {name or '-'}: {fault}") from fault
+    body = {
+        "schema": SCHEMA,
+        "task": task.name,
+        "registered_at": datetime.now(UTC).isoformat(timespec="seconds"),
+        "method": METHOD,
+        **about,
+        "regimes": regimes,
+    }
+    return {**body, "sha256": _hash(body)}
+
+
+def _hash(body: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()
+
+
+def write(path: Path, forecast: Mapping[str, Any]) -> None:
+    """Raises ForecastError; a file that is there already is never written over."""
+    text = json.dumps(forecast, indent=2) + "\n"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError as fault:
+        raise ForecastError(
+            f"{path} is there already: a registered forecast stays as it is; give another --out"
+        ) from fault
+    except OSError as fault:
+        raise ForecastError(f"{path}: {fault.strerror or fault}") from fault
+
+
+def read(path: Path) -> dict[str, Any]:
+    """Raises ForecastError, also when the file was changed after it was written."""
+    try:
+        found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        body = {key: value for key, value in found.items() if key != "sha256"}
+        if found["schema"] != SCHEMA:
+            raise ForecastError(f"{path}: schema {found['schema']!r}, this petrobot reads {SCHEMA}")
+        said = found["sha256"]
+    except (OSError, ValueError, KeyError, TypeError) as fault:
+        raise ForecastError(f"{path} is no forecast: {fault!r}") from fault
+    if said != _hash(body):
+        raise ForecastError(f"{path} was changed after it was registered")
+    return found
+
+
+def exact(task: Task, measured: Measured) -> dict[str, Any]:
+    """The numbers of the stochastic view for one throw, where its space can be solved: a cross-check, not the forecast."""
+    view = stochastic_view(task, measured)
+    found = solve(view)
+    return {
+        "R_goal": found.goal_reliability,
+        "P_complete": found.completion_probability,
+        "R_conj": found.conjunctive_reliability,
+        "mean": found.done.mean,
+        "markings": found.chain.n,
+    }

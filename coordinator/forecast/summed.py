@@ -1,0 +1,58 @@
+"""Training from an estimates file, where only sums and samples of runs are left: every run stands for itself, without history.
+
+So nothing can be unfolded by what had ended before, and the bootstrap is one over runs. A campaign's folder is the better source.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from coordinator.campaign.observed import context_of, regime_of
+from coordinator.campaign.throws import RunEntry, Throw
+from coordinator.estimates_file import EstimatesError, EstimatesFile
+from coordinator.forecast.history import Training
+from coordinator.forecast.registered import ForecastError
+from coordinator.learning.estimate import CENSORED, Tally
+from coordinator.learning.learning import Estimates
+from coordinator.task import Kind, Task
+
+
+def trainings_of(task: Task, path: Path) -> dict[str, Training]:
+    """Of an estimates file, by regime. Raises ForecastError."""
+    try:
+        kept = EstimatesFile(path).read() if path.exists() else None
+    except EstimatesError as fault:
+        raise ForecastError(str(fault)) from fault
+    if kept is None or not kept.estimates.tallies:
+        raise ForecastError(f"{path} holds no estimates; give a campaign's folder or a file that `run --learn` wrote")
+    regimes = sorted({regime_of(key.context) for key in kept.estimates.tallies})
+    return {regime: Training.of(task, _throws(task, kept.estimates, regime)) for regime in regimes}
+
+
+def _throws(task: Task, estimates: Estimates, regime: str) -> list[Throw]:
+    """A throw of its own for each run of the samples, as often as it stands for a run that was counted."""
+    flat, context = task.flat, context_of(regime)
+    out: list[Throw] = []
+    for place in flat.places.values():
+        if place.kind is not Kind.ACTION:
+            continue
+        for key, tally in estimates.tallies.items():
+            if (key.primitive_task, key.context) == (place.task, context):
+                out += [Throw(1, 0.0, runs=[run]) for run in _runs(place.name, key.action, tally)]
+    for where, flow in estimates.flows.items():
+        if (where.task, where.context) == (task.name, context) and flow.waits.n:
+            out.append(Throw(1, 0.0, waits=[(where.transition, flow.waits.mean)]))
+    return out
+
+
+def _runs(place: str, action: str, tally: Tally) -> list[RunEntry]:
+    """Runs with the counts of the tally and the durations of its sample (each exit's, again and again; its mean without any)."""
+    out: list[RunEntry] = []
+    for exit_, moments in tally.durations.items():
+        counted, _, transition = exit_.partition(":")
+        seconds = tally.sample.seconds([exit_]) or [moments.mean]
+        status = "" if counted == CENSORED else counted
+        for i in range(moments.n):
+            took = seconds[i % len(seconds)]
+            out.append(RunEntry(place, action, 0.0, took, status, taken=transition, cancelled=bool(transition)))
+    return out

@@ -1,0 +1,174 @@
+"""The commands as a user meets them: campaign, resume, forecast, comparison, bad input."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import select
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from coordinator.campaign.conduct import Progress
+from coordinator.campaign.progress import ProgressLine, clock, line
+from coordinator.cli import main
+from tests.campaign.conftest import HERE, SERVICES, TASK
+
+ROOT = HERE.parents[1]
+TOY = [str(TASK), "--services", str(SERVICES)]
+
+
+def campaign(folder: Path, *arguments: str) -> dict[str, Any]:
+    """Run the command in this process (its workers are others) and give its JSON."""
+    out = folder.with_suffix(".json")
+    assert main(["campaign", *TOY, "--out", str(folder), "--workers", "1", "--json", str(out), *arguments]) == 0
+    result: dict[str, Any] = json.loads(out.read_text(encoding="utf-8"))
+    return result
+
+
+@pytest.mark.processes
+def test_train_forecast_run_and_compare(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The whole loop on the toy cell, with the promised keys."""
+    train = campaign(
+        tmp_path / "train", "--runs", "300", "--regime", "easy,rough", "--selector", "random", "--block", "30"
+    )
+    promised = {
+        "task",
+        "regimes",
+        "seed",
+        "runs",
+        "selector",
+        "workers",
+        "rows",
+        "R_goal",
+        "P_complete",
+        "wilson",
+        "by_regime",
+    }
+    promised |= {"chosen", "J", "sim_s", "wall_s", "times_real_time_per_core", "estimates"}
+    assert promised <= set(train)
+    assert train["wilson"][0] < train["R_goal"] < train["wilson"][1]
+    assert set(train["by_regime"]) == {"easy", "rough"}
+    assert sum(train["chosen"]["look"].values()) == train["begun"] <= train["runs"] == 300
+    assert all(0 < j < 2.01 for j in train["J"]["look"].values())
+    registered = tmp_path / "f.json"
+    told = ["forecast", str(TASK), "--estimates", str(tmp_path / "train"), "--runs", "150", "--replicates", "60"]
+    assert main([*told, "--out", str(registered)]) == 0
+    new = ["--runs", "300", "--regime", "easy,rough", "--selector", "random", "--block", "30", "--seed", "2"]
+    found = campaign(tmp_path / "new", *new, "--check", str(registered))["check"]
+    assert found["agrees"] and found["registered_before"] and found["same_task_file"]
+    assert {row["figure"] for row in found["rows"]} == {"R_goal", "P_complete", "mean", "q90", "R_conj"}
+    capsys.readouterr()
+    table = tmp_path / "table.md"
+    assert main(["forecast", "--compare", str(registered), str(tmp_path / "new"), "--markdown", str(table)]) == 0
+    assert table.read_text(encoding="utf-8").count("| easy |") == 7
+    assert main(["forecast", "--compare", str(registered), str(tmp_path / "train")]) == 2
+    assert "was trained on" in capsys.readouterr().err
+    file = [
+        "forecast",
+        str(TASK),
+        "--estimates",
+        train["estimates"],
+        "--runs",
+        "100",
+        "--replicates",
+        "20",
+        "--json",
+        "-",
+    ]
+    assert main(file) == 0
+    from_sums = json.loads(capsys.readouterr().out)
+    for regime in ("easy", "rough"):
+        own = train["by_regime"][regime]["R_goal"]
+        assert from_sums["regimes"][regime]["figures"]["R_goal"]["value"] == pytest.approx(own, abs=0.05)
+
+
+@pytest.mark.processes
+def test_a_killed_campaign_goes_on(tmp_path: Path) -> None:
+    """SIGINT on the way, then --resume: the table of one that was never interrupted."""
+    arguments = [
+        *TOY,
+        "--runs",
+        "60",
+        "--regime",
+        "easy,rough",
+        "--selector",
+        "ucb1",
+        "--batch",
+        "10",
+        "--workers",
+        "2",
+    ]
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{HERE}"}
+    command = [sys.executable, "-m", "coordinator", "campaign"]
+
+    def start(*more: str) -> subprocess.Popen[bytes]:
+        return subprocess.Popen([*command, *more], cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL)
+
+    part = start(*arguments, "--out", "part")
+    table = tmp_path / "part" / "table.csv"
+    while not table.exists() and part.poll() is None:
+        select.select([], [], [], 0.01)
+    part.kill()
+    part.wait()
+    assert 0 < table.read_bytes().count(b"\n") < 61
+    assert start("x", "--resume", "part").wait() == 0
+    assert start(*arguments, "--out", "whole").wait() == 0
+    assert table.read_bytes() == (tmp_path / "whole" / "table.csv").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["campaign", *TOY, "--selector", "oracle"], "choose among fixed, round_robin"),
+        (["campaign", *TOY, "--choose", "look=stare"], "choose among look_quick"),
+        (["campaign", *TOY, "--choose", "look"], "write NAME=VALUE"),
+        (["campaign", *TOY, "--regime", "easy,easy"], "each regime once"),
+        (["campaign", *TOY, "--seed", "-1"], "0 or more"),
+        (["campaign", *TOY, "--set", "speed=1"], "no parameter 'speed'"),
+        (["campaign", "x", "--resume", "nowhere"], "holds no campaign"),
+        (["campaign", *TOY, "--learned", "nowhere"], "no finished campaign"),
+        (["forecast", str(TASK)], "--estimates CAMPAIGN"),
+        (["forecast", str(TASK), "--estimates", "nowhere.db"], "holds no estimates"),
+        (["forecast", "--compare", "nowhere.json", "nowhere"], "is no forecast"),
+    ],
+)
+def test_bad_input(
+    arguments: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Exit code 2, and one line with the remedy."""
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    assert said in capsys.readouterr().err
+
+
+# --- progress ------------------------------------------------------------------------------------------------------------
+
+
+def test_progress_line() -> None:
+    """Bar, share that met its goal in this session, time to go from this session's speed."""
+    shown = line(Progress(60, 100, 20, 30, 80.0))
+    assert "60/100" in shown and "75.0% met" in shown and "1:20 gone, 1:20 to go" in shown
+    assert line(Progress(0, 10, 0, 0, 0.0)).startswith("[....")
+    assert [clock(s) for s in (0, 59.6, 3600)] == ["0:00", "1:00", "1:00:00"]
+
+
+def test_progress_is_for_terminals(capsys: pytest.CaptureFixture[str]) -> None:
+    """One line written over in a terminal, nothing elsewhere."""
+    silent = ProgressLine(sys.stderr)
+    silent(Progress(1, 2, 0, 1, 1.0))
+    silent.close()
+    assert capsys.readouterr().err == ""
+    ours, theirs = pty.openpty()
+    with os.fdopen(theirs, "w") as terminal:
+        shown = ProgressLine(terminal)
+        for done in (1, 2):
+            shown(Progress(done, 2, 0, 1, float(done)))
+        shown.close()
+        told = os.read(ours, 1000)
+    os.close(ours)
+    assert told.count(b"\r[") == 2 and told.count(b"\n") == 1
