@@ -1,0 +1,338 @@
+"""The rover's primitive actions: enable the drives, follow the track, recover it across an interruption, search, stop at the T.
+
+All are coroutines that see the driver only through `ctx.device`, a `Remote` of `services.mobile.rover:Rover`. Error causes:
+`drive_fault`, `power`, `bus` (as the driver says), `stale_set_point`, `no_line`, `refused`, `timeout`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
+
+from services.action import Cancelled, Context, Result, error, failure, success
+from services.mobile import paths
+from services.mobile.model import nominal_rover
+from services.mobile.odometry import Pose, turned
+from services.mobile.sight import TrackEnd
+
+RENEW: Final = 0.1
+"""s between repeated motion commands: a driver that hears none for 0.4 s rests."""
+ANSWER: Final = 0.5
+"""s within which the driver takes a command."""
+TAKE_OVER: Final = 0.34
+"""m before the end of the line at which following has done its part: what comes next begins on the move."""
+BEYOND: Final = 0.6
+"""m that a plan goes on straight where the track should have been found."""
+STUCK: Final = 0.5
+"""s of standing without a line after which it counts as lost."""
+NEAR_GATE: Final = 0.40
+"""m off where a track can resume within which a reflector is taken to mark it."""
+REFLECTOR_PATIENCE: Final = 1.2
+"""s that a reflector is waited for at the line's end."""
+LOOK: Final = 0.35
+"""s of looking after each turn of a search."""
+STOP_AT: Final = 0.10
+"""m beyond the T's bar where the axle comes to stand: the middle of what the rules allow."""
+
+Judge = Callable[[Mapping[str, Any]], Result | None]
+
+
+async def enable_drives(ctx: Context, *, timeout: float = 8.0, forget: bool = False) -> Result:
+    """Reset faults and enable both drives; the rover stands. ERROR as the driver says if they stay in fault.
+
+    With `forget` the map of the track is emptied: the rover has been carried elsewhere.
+    """
+    until = ctx.now + timeout
+    why = await _command(ctx, {"do": "reset"})
+    if why:
+        return error("refused", why)
+    if forget:
+        await _command(ctx, {"do": "forget"})
+    if not await ctx.wait(lambda: bool(ctx.device.state["enabled"]), max(0.0, until - ctx.now)):
+        return _trouble(ctx.device.state) or error("timeout", f"the drives were not enabled within {timeout} s")
+    return success()
+
+
+async def follow_feed_forward(ctx: Context, *, speed: float = 0.5, timeout: float = 240.0, patience: float = 6.0) -> Result:
+    """Follow the track to its end by its own curvature plus PD on the error at the axle. See `_follow`."""
+    return await _follow(ctx, "feed_forward", speed, timeout, patience)
+
+
+async def follow_pursuit(ctx: Context, *, speed: float = 0.5, timeout: float = 240.0, patience: float = 6.0) -> Result:
+    """Follow the track to its end by pure pursuit of a point of it ahead. See `_follow`."""
+    return await _follow(ctx, "pursuit", speed, timeout, patience)
+
+
+async def home_on_reflector(
+    ctx: Context, *, line_end: Sequence[float], speed: float = 0.5, timeout: float = 25.0
+) -> Result:
+    """Recover the track by the reflector above the point where it resumes: drive the circle through it. See `_recover`.
+
+    FAILURE `no_reflector` when none answers from where the track can resume.
+    """
+    end, gates = _geometry(line_end)
+    where: tuple[float, float] | None = None
+
+    def found() -> bool:
+        nonlocal where
+        where = _marked(ctx.device.state["reflectors"], gates)
+        return where is not None
+
+    drive = _Drive(ctx, "feed_forward", speed, timeout)
+    stuck = await drive.start(gates)
+    if stuck is not None:
+        return stuck
+    if not found():
+        await drive.until(lambda state: success() if found() else None, REFLECTOR_PATIENCE)
+    if where is None:
+        await drive.rest()
+        return failure("no_reflector", "no reflector answers from where the track can resume", recovered=False)
+    return await _along(drive, paths.arc_through(end, *where, BEYOND))
+
+
+async def dead_reckon(
+    ctx: Context, *, line_end: Sequence[float], speed: float = 0.5, curvature: float = 0.0, timeout: float = 25.0
+) -> Result:
+    """Recover the track by driving on along the curve that the missing element is expected to have. See `_recover`.
+
+    `curvature` (1/m, to the left positive): 0 expects a straight, 1 or -1 a quarter arc.
+    """
+    end, gates = _geometry(line_end)
+    drive = _Drive(ctx, "feed_forward", speed, timeout)
+    stuck = await drive.start(gates)
+    if stuck is not None:
+        return stuck
+    square = nominal_rover().track.square
+    length = square if curvature == 0.0 else 0.5 * math.pi / abs(curvature)
+    last = Pose(*paths.arc(end, curvature, length)[-1], end.heading + curvature * length)
+    return await _along(drive, paths.arc(end, curvature, length) + paths.arc(last, 0.0, BEYOND - 0.2))
+
+
+async def search_pattern(
+    ctx: Context, *, line_end: Sequence[float], speed: float = 0.4, rate: float = 1.2, timeout: float = 60.0
+) -> Result:
+    """Recover the track by going to the middle of the empty square and looking straight on, to the left and to the right.
+
+    Needs no sensor and no guess, and finds the way back from a wrong guess; takes longest. See `_recover`.
+    """
+    end, gates = _geometry(line_end)
+    drive = _Drive(ctx, "feed_forward", speed, timeout)
+    stuck = await drive.start(gates)
+    if stuck is not None:
+        return stuck
+    middle = Pose(*end.floor(0.8 * nominal_rover().track.radius, 0.0), end.heading)
+    ended = await _go(drive, middle, rate)
+    for turn in (0.0, 1.4, -1.4, 0.7, -0.7):
+        if ended is not None:
+            return ended
+        ended = await _look(drive, turned(middle.heading + turn), rate)
+    return ended or failure("no_track", "the track is not where it can resume", recovered=False)
+
+
+async def stop_at_t(ctx: Context, *, line_end: Sequence[float], speed: float = 0.35, timeout: float = 12.0) -> Result:
+    """Come to stand with the axle just behind the T's bar. SUCCESS when standing within 0.3 m of it; ERROR as the driver says."""
+    end = Pose(*map(float, line_end))
+    drive = _Drive(ctx, "feed_forward", speed, timeout)
+    stuck = await drive.start(())
+    if stuck is None:
+        await _command(ctx, {"do": "plan", "points": paths.arc(end, 0.0, STOP_AT)})
+        stuck = await drive.until(lambda state: success() if _stands(state) else None, timeout)
+    await drive.rest()
+    if stuck.cause:
+        return stuck
+    await ctx.wait(lambda: bool(ctx.device.state["standing"]), 2.0)
+    x, y, _ = ctx.device.state["pose"]
+    ahead, aside = end.body(x, y)
+    if not (-0.1 < ahead < 0.3 and abs(aside) < 0.3):
+        return failure("off_the_t", f"stands {ahead:.2f} m beyond and {aside:.2f} m beside the T", ahead=ahead, aside=aside)
+    return success(ahead=ahead, aside=aside)
+
+
+def _stands(state: Mapping[str, Any]) -> bool:
+    return bool(state["standing"]) and (state["ahead"] < 0.05 or state["reason"] == "no_line")
+
+
+async def _follow(ctx: Context, law: str, speed: float, timeout: float, patience: float) -> Result:
+    """Follow the streamed track until its end is near; the rover rolls on for what comes next.
+
+    SUCCESS: `at_t` says whether the T or an interruption ends it, `line_end` where (pose in the odometry frame). FAILURE
+    `unannounced_end` (same values) when the line just ceased. ERROR: `no_line` when none was seen within `patience` s,
+    `stale_set_point` when the stream ceased, or as the driver says.
+    """
+    drive = _Drive(ctx, law, speed, timeout)
+    begun = ctx.now
+    lost: dict[str, float] = {}
+
+    def judge(state: Mapping[str, Any]) -> Result | None:
+        if state["end"] is not None and state["ahead"] < TAKE_OVER and state["line_end"] is not None:
+            return success(at_t=state["end"] == TrackEnd.T, line_end=list(state["line_end"]))
+        why = state["reason"]
+        if why not in ("no_line", "stale") or not state["standing"]:
+            lost.clear()
+            return None
+        since = lost.setdefault(why, ctx.now)
+        if why == "stale" and ctx.now - since > max(STUCK, min(patience, 1.0)) and ctx.now - begun > patience:
+            return error("stale_set_point", f"the stream of sights has ceased for {ctx.now - since:.1f} s")
+        if why == "no_line" and state["sights"] and state["line_end"] is not None and ctx.now - since > STUCK:
+            return failure("unannounced_end", "the line ceased", at_t=False, line_end=list(state["line_end"]))
+        if ctx.now - begun > patience and ctx.now - since > STUCK:
+            return error("no_line", f"no line to follow for {ctx.now - since:.1f} s")
+        return None
+
+    try:
+        result = await drive.until(judge, timeout)
+    except Cancelled:
+        ctx.device.send({"do": "rest"})
+        raise
+    if result.cause:
+        await drive.rest()
+    return result
+
+
+async def _along(drive: _Drive, plan: paths.Points) -> Result:
+    """Drive along a plan until the track is seen again and near, or the plan is at its end."""
+    await _command(drive.ctx, {"do": "plan", "points": plan})
+    result = await drive.until(_recovered, drive.left())
+    if not result.cause:
+        return result
+    await drive.rest()
+    return result
+
+
+def _recovered(state: Mapping[str, Any]) -> Result | None:
+    """What recovering has come to; None while it goes on."""
+    if state["regained"]:
+        return success(recovered=True)
+    if state["standing"] and (state["ahead"] < 0.08 or state["reason"] == "no_line"):
+        return failure("no_track", "the way expected has been driven to its end and no track was seen", recovered=False)
+    return None
+
+
+async def _go(drive: _Drive, to: Pose, rate: float) -> Result | None:
+    """Go to a place by turning towards it and driving straight; None when there, else how the run ends."""
+    ctx = drive.ctx
+    x, y, heading = ctx.device.state["pose"]
+    away = math.hypot(to.x - x, to.y - y)
+    if away < 0.08:
+        return None
+    towards = math.atan2(to.y - y, to.x - x)
+    if abs(turned(towards - heading)) > 0.3:
+        ended = await _turn(drive, towards, rate)
+        if ended is not None:
+            return ended
+        x, y, _ = ctx.device.state["pose"]
+        await _command(ctx, {"do": "forget", "seen": not ctx.device.state["sights"]})
+    await _command(ctx, {"do": "plan", "points": [(x, y), *paths.straight((x, y), (to.x, to.y))]})
+
+    def judge(state: Mapping[str, Any]) -> Result | None:
+        if state["regained"]:
+            return success(recovered=True)
+        if state["standing"] and (state["ahead"] < 0.08 or state["reason"] == "no_line"):
+            return failure("arrived")
+        return None
+
+    ended = await drive.until(judge, min(20.0, drive.left()))
+    return None if ended.cause == "arrived" else ended
+
+
+async def _turn(drive: _Drive, heading: float, rate: float) -> Result | None:
+    """Turn on the spot to a heading (rad, odometry frame); None when done, else how the run ends."""
+    ended = await drive.until(
+        lambda state: success() if state["reason"] == "arrived" and state["mode"] == "turn" else None,
+        min(8.0, drive.left()),
+        {"do": "turn", "to": heading, "rate": rate},
+    )
+    return ended if ended.cause else None
+
+
+async def _look(drive: _Drive, heading: float, rate: float) -> Result | None:
+    """Turn to a heading and look; drive to the track if it is there. None when it is not."""
+    ctx = drive.ctx
+    ended = await _turn(drive, heading, rate)
+    if ended is not None:
+        return ended
+    await ctx.wait(lambda: ctx.device.state["sights"] > 0, LOOK)
+    state = ctx.device.state
+    if not state["sights"] or state["view"] is None:
+        return None
+    x, y, fx, fy = state["view"]
+    there = Pose(x, y, math.atan2(fy - y, fx - x))
+    await _command(ctx, {"do": "plan", "points": paths.join(Pose(*state["pose"]), there, 0.0)})
+    result = await drive.until(_recovered, min(15.0, drive.left()))
+    return None if result.cause == "no_track" else result
+
+
+class _Drive:
+    """Repeats the motion command as the driver asks for, and looks at its state whenever there is something new."""
+
+    def __init__(self, ctx: Context, law: str, speed: float, timeout: float) -> None:
+        self.ctx = ctx
+        self._follow = {"do": "follow", "law": law, "speed": speed}
+        self._until = ctx.now + timeout
+
+    def left(self) -> float:
+        """s that the run may still take."""
+        return max(0.0, self._until - self.ctx.now)
+
+    async def start(self, gates: Sequence[Pose]) -> Result | None:
+        """Begin a new stretch that leads through one of the gates; how the run ends if the driver refuses."""
+        why = await _command(self.ctx, {"do": "stretch", "gates": [tuple(gate) for gate in gates]})
+        return error("refused", why) if why else None
+
+    async def rest(self) -> None:
+        """Brake and stand."""
+        await _command(self.ctx, {"do": "rest"})
+
+    async def until(self, judge: Judge, timeout: float, body: Mapping[str, Any] | None = None) -> Result:
+        """Go on until `judge(state)` gives a result, the driver is in trouble, or `timeout` s are over."""
+        ctx, wanted = self.ctx, body or self._follow
+        until, renewed = ctx.now + timeout, -math.inf
+        while ctx.now <= until:
+            if ctx.now - renewed >= RENEW:
+                renewed = ctx.now
+                why = await _command(ctx, wanted)
+                if why:
+                    return _trouble(ctx.device.state) or error("refused", why)
+            state = ctx.device.state
+            result = _trouble(state) or judge(state)
+            if result is not None:
+                return result
+            seen = state["cycles"]
+            await ctx.wait(lambda seen=seen: ctx.device.state["cycles"] != seen, RENEW)  # type: ignore[misc]
+        return error("timeout", f"nothing came of it in {timeout:.1f} s")
+
+
+def _geometry(line_end: Sequence[float]) -> tuple[Pose, tuple[Pose, Pose, Pose]]:
+    """The line's end and where the track can resume."""
+    track = nominal_rover().track
+    end = Pose(*map(float, line_end))
+    return end, paths.resume_poses(end, track.square, track.radius)
+
+
+def _marked(
+    reflectors: Sequence[Sequence[float]], gates: Sequence[Pose]
+) -> tuple[float, float] | None:
+    """The reflector above one of the places where the track can resume; the most often heard if there are several."""
+    best: tuple[float, float, float] | None = None
+    for x, y, echoes in reflectors:
+        off = min(math.hypot(x - gate.x, y - gate.y) for gate in gates)
+        if off < NEAR_GATE and (best is None or echoes > best[2]):
+            best = (x, y, echoes)
+    return None if best is None else (best[0], best[1])
+
+
+def _trouble(state: Mapping[str, Any]) -> Result | None:
+    """The driver's first fault as an action's end."""
+    if state["faults"]:
+        cause, wheel, code, text = state["faults"][0]
+        return error(cause, text, wheel=wheel, code=code)
+    return None
+
+
+async def _command(ctx: Context, body: Mapping[str, Any]) -> str:
+    """Send a command and wait until the driver has taken it; gives why it was refused, empty if it was not."""
+    number = ctx.device.send(body)
+    if not await ctx.wait(lambda: ctx.device.handled >= number, ANSWER):
+        return "the driver does not answer"
+    return str(ctx.device.refused)

@@ -1,0 +1,363 @@
+"""The rover's driver: every 20 ms it reads wheels and sensor, takes the newest sight of the track, and sets two wheel speeds.
+
+It follows its map of the track, whether the points in it were seen or are only planned; it turns on the spot; it rests. It
+never drives where the map does not reach, and rests when the stream is stale or the action that wanted the motion is silent.
+
+Commands: {"do": "follow", "law", "speed"} (repeat it within `LEASE` s), {"do": "plan", "points"}, {"do": "turn", "to", "rate"}
+(also repeated), {"do": "stretch"} (a new stretch begins), {"do": "forget"}, {"do": "rest"}, {"do": "reset"}, {"do": "disable"}.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+from services.device import Ports, Setpoint
+from services.mobile.following import LAWS, SpeedProfile, capped
+from services.mobile.model import Rover as Numbers
+from services.mobile.model import nominal_rover, read_rover
+from services.mobile.odometry import Odometry, Pose, turned
+from services.mobile.reflectors import ReflectorMap, parse_echoes
+from services.mobile.sight import TrackAhead, TrackEnd
+from services.mobile.track_map import Fit, TrackMap
+from services.mobile.wheel_drives import Phase, WheelMaster
+
+LEASE: Final = 0.4
+"""s after which a motion that nobody asks for again ends."""
+STANDING: Final = 0.004
+"""m/s below which the rover counts as standing."""
+STREAM: Final = "track_ahead"
+TURN_GAIN: Final = 3.0
+"""1/s: turning speed for each radian that is left."""
+TURNED: Final = 0.02
+"""rad within which a turn has arrived."""
+END_REACH: Final = 0.45
+"""m of line that tell its direction at its end."""
+REGAINED_SIGHTS: Final = 4
+"""Sights of a new stretch, at most so many m ahead and aside and so many rad askew, after which it can be followed."""
+REGAINED_AHEAD: Final = 0.62
+REGAINED_ASIDE: Final = 0.25
+REGAINED_TURN: Final = 0.6
+DRIVES_SHARE: Final = 0.95
+"""Part of the wheels' top speed that set points use: the rest is for the lead over their lag."""
+
+
+class Rover:
+    """Driver of the rover (see `services.device.Driver`). Its keys in services.toml, all optional but those of its bus:
+
+    `rover`: file of numbers beside services.toml (default: the shipped one).
+    """
+
+    def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
+        name = str(config.get("rover", ""))
+        self.numbers: Numbers = read_rover(ports.file(name).decode(), name) if name else nominal_rover()
+        wheels, bus = self.numbers.wheels, self.numbers.bus
+        self.period: float | None = bus.period
+        self._ports = ports
+        self._bus = ports.can()
+        self._setpoint: Setpoint = ports.stream(STREAM)
+        self._master = WheelMaster(round(bus.left), round(bus.right), round(bus.sensor), bus.period, wheels.quick_stop)
+        self._odometry = Odometry(wheels.track_width)
+        self._map = TrackMap()
+        self._reflectors = ReflectorMap(self.numbers.sensor, self.numbers.track.reflector_height)
+        self._profile = SpeedProfile()
+        self._mode, self._reason = "off", ""
+        self._paused = False
+        self._leased_until = 0.0
+        self._law, self._asked, self._heading, self._rate = "feed_forward", 0.0, 0.0, 1.0
+        self._speed = self._turning = self._measured = 0.0
+        self._set = (0.0, 0.0)
+        self._taken = 0
+        self._view: TrackAhead | None = None
+        self._viewed_from = self._odometry.pose
+        self._cycles = 0
+        self._fits: dict[float, Fit | None] = {}
+        self._commands: dict[str, Callable[[float, Mapping[str, Any]], None]] = {
+            "follow": self._follow,
+            "turn": self._turn,
+            "plan": lambda now, body: self._plan(body),
+            "stretch": lambda now, body: self._stretch(body),
+            "forget": lambda now, body: self._forget(body),
+            "rest": lambda now, body: self._rest("asked"),
+            "reset": lambda now, body: self._master.reset(now),
+            "disable": lambda now, body: self._disable(),
+        }
+
+    # Driver contract
+
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        """Take a command; raises ValueError for one that is unknown, malformed, or cannot be obeyed now."""
+        act = self._commands.get(str(body.get("do")))
+        if act is None:
+            raise ValueError(f"unknown command {body.get('do')!r}: know {', '.join(self._commands)}")
+        act(now, body)
+
+    def step(self, now: float) -> None:
+        """One cycle."""
+        self._cycles += 1
+        self._fits.clear()
+        self._listen(now)
+        self._measure(now)
+        self._look(now)
+        speeds = self._drive(now)
+        try:
+            for frame in self._master.advance(now, speeds):
+                self._bus.send(frame)
+        except ConnectionError as reason:
+            self._master.bus_lost(now, str(reason))
+
+    def state(self) -> Mapping[str, Any]:
+        """What actions, operator and report see; docs/mobile.md explains the keys."""
+        pose, end = self._odometry.pose, self._map.end
+        fit = self._fit(0.0)
+        return {
+            "enabled": self._master.enabled,
+            "phase": self._master.phase.value,
+            "mode": self._mode,
+            "reason": self._reason,
+            "pose": tuple(pose),
+            "way": self._odometry.way,
+            "speed": self._measured,
+            "standing": self._standing(),
+            "ahead": self._map.ahead(pose),
+            "end": None if end is None else int(end[0]),
+            "line_end": self._line_end(),
+            "regained": self._regained(),
+            "on_line": fit is not None,
+            "offset": 0.0 if fit is None else fit.y,
+            "heading": 0.0 if fit is None else fit.heading,
+            "view": self._viewed(),
+            "sights": self._map.sights,
+            "refused": self._map.refused,
+            "stream_age": self._setpoint.age,
+            "reflectors": self._reflectors.believed(),
+            "sensor": self._master.sensor_alive,
+            "limited": self._master.limited,
+            "faults": [(t.cause, t.wheel, t.code, t.text) for t in self._master.troubles],
+            "cycles": self._cycles,
+        }
+
+    def stop(self, now: float) -> None:
+        """Brake, and stand."""
+        self._rest("stopped")
+
+    def stopped(self) -> bool:
+        """Whether the rover stands, or its drives are off and so its brakes hold."""
+        return self._standing() and self._mode in ("off", "rest")
+
+    def hold(self, now: float) -> str:
+        """Operator's pause: brake, and go on with the same after `release`."""
+        self._paused = True
+        return "held"
+
+    def release(self, now: float) -> None:
+        """End of the pause."""
+        self._paused = False
+        self._leased_until = max(self._leased_until, now + LEASE)
+
+    def close(self) -> None:
+        """Leave the bus; the drives stop by themselves when SYNC and heartbeat cease."""
+        self._bus.close()
+
+    # Commands
+
+    def _follow(self, now: float, body: Mapping[str, Any]) -> None:
+        self._ready("follow")
+        law = str(body.get("law", self._law))
+        if law not in LAWS:
+            raise ValueError(f"unknown law {law!r}: know {', '.join(LAWS)}")
+        self._law, self._asked = law, _positive(body, "speed")
+        self._lease(now, "follow")
+
+    def _turn(self, now: float, body: Mapping[str, Any]) -> None:
+        self._ready("turn")
+        to = body.get("to")
+        if not isinstance(to, int | float) or not math.isfinite(to):
+            raise ValueError(f"turn: to = {to!r}: give a heading in rad, odometry frame")
+        self._heading, self._rate = float(to), _positive(body, "rate", 1.0)
+        self._lease(now, "turn")
+
+    def _plan(self, body: Mapping[str, Any]) -> None:
+        points = body.get("points", ())
+        if any(len(p) != 2 or not all(math.isfinite(c) for c in p) for p in points):
+            raise ValueError("plan: points are pairs of finite numbers (m, odometry frame)")
+        self._map.plan(points)
+
+    def _stretch(self, body: Mapping[str, Any]) -> None:
+        gates = body.get("gates", ())
+        if any(len(gate) != 3 or not all(math.isfinite(c) for c in gate) for gate in gates):
+            raise ValueError("stretch: gates are poses of three finite numbers (m, m, rad, odometry frame)")
+        self._map.begin([Pose(*map(float, gate)) for gate in gates])
+
+    def _forget(self, body: Mapping[str, Any]) -> None:
+        if body.get("seen", True):
+            self._map.drop_seen()
+            self._map.begin()
+        if body.get("plan", True):
+            self._map.drop_plan()
+
+    def _disable(self) -> None:
+        self._master.wanted = False
+        self._rest("disabled")
+
+    def _ready(self, what: str) -> None:
+        if not self._master.enabled:
+            troubles = "; ".join(trouble.text for trouble in self._master.troubles) or self._master.phase.value
+            raise ValueError(f"cannot {what}: the drives are not enabled ({troubles})")
+
+    def _lease(self, now: float, mode: str) -> None:
+        self._leased_until = now + LEASE
+        self._mode, self._reason = mode, ""
+
+    def _rest(self, reason: str) -> None:
+        if self._mode != "off":
+            self._mode, self._reason = "rest", reason
+
+    # The cycle
+
+    def _listen(self, now: float) -> None:
+        try:
+            frames = self._bus.receive()
+        except ConnectionError as reason:
+            self._master.bus_lost(now, str(reason))
+            return
+        for frame in frames:
+            self._master.receive(now, frame)
+
+    def _measure(self, now: float) -> None:
+        """Odometry and echoes."""
+        radius = self.numbers.wheels.wheel_radius
+        left, right = (wheel.turned() * radius for wheel in self._master.wheels)
+        self._odometry.add(now, left, right)
+        self._measured = 0.5 * (left + right) / self.numbers.bus.period
+        self._turning = (right - left) / self.numbers.wheels.track_width / self.numbers.bus.period
+        if self._master.echoes:
+            for frame in self._master.echoes:
+                self._reflectors.take(now, self._odometry.pose, parse_echoes(frame))
+            self._master.echoes.clear()
+
+    def _look(self, now: float) -> None:
+        """Take the newest sight of the track into the map."""
+        setpoint = self._setpoint
+        if setpoint.count == self._taken or setpoint.values is None:
+            return
+        self._taken = setpoint.count
+        try:
+            self._view = TrackAhead.parse(setpoint.values, setpoint.held)
+        except ValueError:
+            return
+        self._viewed_from = self._odometry.at(now - self._view.age)
+        self._map.take(self._viewed_from, self._view)
+        self._fits.clear()
+
+    def _drive(self, now: float) -> tuple[float, float]:
+        """Speeds of the wheels (rad/s) for this cycle."""
+        enabled = self._master.enabled
+        if not enabled:
+            self._mode, self._speed = "off", 0.0
+            return self._set_wheels(0.0, 0.0)
+        if self._mode == "off":
+            self._mode, self._reason = "rest", "enabled"
+        if self._mode in ("follow", "turn") and now > self._leased_until and not self._paused:
+            self._rest("silent_action")
+        if self._paused or self._mode == "rest":
+            return self._brake()
+        return self._turn_on() if self._mode == "turn" else self._follow_on()
+
+    def _follow_on(self) -> tuple[float, float]:
+        if self._setpoint.values is None and not self._end_is_known():
+            self._reason = "stale"
+            return self._brake()
+        curvature = LAWS[self._law].curvature(self._fit, self._speed)
+        if curvature is None:
+            curvature = LAWS["pursuit"].curvature(self._fit, self._speed)
+        ahead = self._map.ahead(self._odometry.pose)
+        if curvature is None or ahead <= 0.0:
+            self._reason = "no_line"
+            return self._brake()
+        self._reason = ""
+        wanted = self._profile.speed(self._asked, curvature, ahead)
+        self._speed = self._profile.towards(self._speed, wanted, self.numbers.bus.period)
+        return self._set_wheels(self._speed, self._speed * curvature)
+
+    def _end_is_known(self) -> bool:
+        """Whether the track is known to its end, so that nothing needs to be seen any more until there."""
+        return self._map.end is not None
+
+    def _turn_on(self) -> tuple[float, float]:
+        if abs(self._speed) > 0.01:
+            return self._brake()
+        left = turned(self._heading - self._odometry.pose.heading)
+        rate = capped(TURN_GAIN * left, self._rate)
+        if abs(left) < TURNED:
+            self._reason, rate = "arrived", 0.0
+        return self._set_wheels(0.0, rate)
+
+    def _brake(self) -> tuple[float, float]:
+        """Come to rest along the line if one is known, else straight on."""
+        self._speed = self._profile.towards(self._speed, 0.0, self.numbers.bus.period)
+        if self._speed <= 1e-6:
+            return self._set_wheels(0.0, 0.0)
+        curvature = LAWS[self._law].curvature(self._fit, self._speed) or 0.0
+        return self._set_wheels(self._speed, self._speed * capped(curvature, 1.5))
+
+    def _set_wheels(self, speed: float, turning: float) -> tuple[float, float]:
+        """Wheel speeds (rad/s) with a lead over the wheels' lag, both scaled down when one is beyond what it can do."""
+        wheels, period = self.numbers.wheels, self.numbers.bus.period
+        half = 0.5 * wheels.track_width
+        left, right = (speed - turning * half) / wheels.wheel_radius, (speed + turning * half) / wheels.wheel_radius
+        most = max(abs(left), abs(right)) / (DRIVES_SHARE * wheels.top_speed)
+        if most > 1.0:
+            left, right = left / most, right / most
+        before, self._set = self._set, (left, right)
+        steepest = wheels.acceleration
+        leads = (capped((new - old) / period, steepest) for new, old in zip(self._set, before, strict=True))
+        lead_left, lead_right = (wheels.wheel_lag * lead for lead in leads)
+        return left + lead_left, right + lead_right
+
+    def _fit(self, x: float) -> Fit | None:
+        """The map's line `x` m ahead of the axle, worked out once in a cycle."""
+        if x not in self._fits:
+            self._fits[x] = self._map.fit(self._odometry.pose, x)
+        return self._fits[x]
+
+    def _viewed(self) -> tuple[float, ...] | None:
+        """The newest sight for who looks for a lost track: the nearest point and one farther on (m, odometry frame)."""
+        view = self._view
+        if view is None or self._setpoint.values is None or len(view.points) < 3:
+            return None
+        near, far = view.points[0], view.points[min(len(view.points) - 1, 6)]
+        return (*self._viewed_from.floor(*near), *self._viewed_from.floor(*far))
+
+    def _line_end(self) -> tuple[float, float, float] | None:
+        """Pose of the line where it is known to end, or as far as it is known at all."""
+        place = self._map.end_place
+        if place is None:
+            return None
+        pose = self._odometry.pose
+        x, y = pose.body(*place)
+        fit = self._map.fit(pose, x, END_REACH)
+        return None if fit is None else (*place, pose.heading + fit.heading)
+
+    def _regained(self) -> bool:
+        """Whether a new stretch has been seen often and lies well before the rover."""
+        near = self._map.nearest_fresh
+        if self._map.sights < REGAINED_SIGHTS or near is None:
+            return False
+        x, y = self._odometry.pose.body(*near)
+        fit = self._map.fit(self._odometry.pose, max(0.2, x + 0.1))
+        return x < REGAINED_AHEAD and abs(y) < REGAINED_ASIDE and fit is not None and abs(fit.heading) < REGAINED_TURN
+
+    def _standing(self) -> bool:
+        return abs(self._measured) < STANDING and abs(self._turning) < 0.02
+
+
+def _positive(body: Mapping[str, Any], key: str, default: float | None = None) -> float:
+    value = body.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < 10.0:
+        raise ValueError(f"{key} = {value!r}: must be above 0 and below 10")
+    return float(value)
+
+
+__all__ = ["LEASE", "Phase", "Pose", "Rover", "TrackEnd"]

@@ -1,0 +1,243 @@
+"""What is known of the track near the rover: points of its centre line in the odometry frame, seen or only expected.
+
+The camera sees the track only from 0.4 m ahead on; what it saw is kept until the axle has passed over it, so that the error at
+the axle itself is known. Where the track is interrupted, the points of a plan stand in for what cannot be seen: whoever
+follows the map need not know the difference.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.mobile.odometry import Pose
+from services.mobile.paths import passes
+from services.mobile.sight import End, TrackAhead, TrackEnd
+
+Vector = NDArray[np.float64]
+
+CAPACITY = 1000
+"""Points kept; the oldest go."""
+STEP = 0.015
+"""m or, turning, about as many degrees between two sights that are taken: a standing rover learns nothing new."""
+TURN_STEP = 0.03
+REACH = 0.26
+"""m around a place within which points bear on the fit there, the nearer the more."""
+NEEDED = 4
+"""Points that a fit needs."""
+OTHER = 0.15
+"""m off what is known from which a sight is of something else."""
+GATE_ASIDE, GATE_TURN = 0.3, 0.6
+"""m and rad that a line may be off a gate."""
+ENDS = 12
+"""Sights of an end that are averaged."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """The line near a place, in the body frame of a pose: y, slope and bend at that distance ahead (m, 1, 1/m)."""
+
+    y: float
+    slope: float
+    bend: float
+
+    @property
+    def heading(self) -> float:
+        """Direction against the pose's (rad)."""
+        return math.atan(self.slope)
+
+    @property
+    def curvature(self) -> float:
+        """1/m, to the left positive."""
+        return self.bend / (1.0 + self.slope * self.slope) ** 1.5
+
+
+class TrackMap:
+    """Points with weights. All arguments in the odometry frame unless a name says otherwise."""
+
+    def __init__(self) -> None:
+        self._points = np.zeros((CAPACITY, 3))
+        self._count = 0
+        self._taken_at: Pose | None = None
+        self._planned: Vector = np.empty((0, 3))
+        self._ends: deque[tuple[TrackEnd, float, float]] = deque(maxlen=ENDS)
+        self.tip: tuple[float, float] | None = None
+        """The farthest point known."""
+        self.refused = 0
+        """Sights in a row that did not fit what was known."""
+        self.sights = 0
+        """Sights taken since `begin`."""
+        self.nearest_fresh: tuple[float, float] | None = None
+        """The nearest point of the newest of them."""
+        self._gates: tuple[Pose, ...] = ()
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self.__init__()  # type: ignore[misc]
+
+    def begin(self, gates: Sequence[Pose] = ()) -> None:
+        """A new stretch begins: what lies behind stays for the axle to pass over, the end of the last one is forgotten.
+
+        With `gates` only a line that leads through one of them is taken for it: others may be in view.
+        """
+        self._ends.clear()
+        self.sights, self.refused, self.nearest_fresh = 0, 0, None
+        self._gates = tuple(gates)
+
+    # Taking in
+
+    def take(self, pose: Pose, ahead: TrackAhead) -> bool:
+        """A sight from `pose` (where the rover was at exposure). False if it was not taken: nothing new, or something else."""
+        if len(ahead.points) < 3:
+            return False
+        if not self._admitted(pose, ahead.points) or self._contradicts(pose, ahead.points):
+            self.refused += 1
+            return False
+        self.refused = 0
+        if ahead.end is not None:
+            self._note_end(pose, ahead.end)
+        self._see_instead_of_plan(pose, ahead.points)
+        self.tip = pose.floor(*ahead.points[-1])
+        self.nearest_fresh = pose.floor(*ahead.points[0])
+        if self._nothing_new(pose):
+            return False
+        self._taken_at = pose
+        self.sights += 1
+        for x, y in ahead.points:
+            self._add(*pose.floor(x, y), 1.0 / (0.3 + x * x))  # near points are seen more sharply
+        return True
+
+    def plan(self, points: Sequence[Sequence[float]]) -> None:
+        """Expect the track at these points (m), near to far, instead of those expected before."""
+        self._planned = np.array([[x, y, 1.0] for x, y in points], dtype=float).reshape(-1, 3)
+        self._ends.clear()
+        if len(self._planned):
+            self.tip = (float(self._planned[-1, 0]), float(self._planned[-1, 1]))
+
+    def drop_seen(self) -> None:
+        """Forget what was seen, not what is expected."""
+        self._count, self._taken_at = 0, None
+
+    def drop_plan(self) -> None:
+        """Expect nothing more; what was seen stays."""
+        self._planned = np.empty((0, 3))
+
+    def _add(self, x: float, y: float, weight: float) -> None:
+        self._points[self._count % CAPACITY] = (x, y, weight)
+        self._count += 1
+
+    def _nothing_new(self, pose: Pose) -> bool:
+        last = self._taken_at
+        if last is None:
+            return False
+        return math.hypot(pose.x - last.x, pose.y - last.y) < STEP and abs(pose.heading - last.heading) < TURN_STEP
+
+    def _admitted(self, pose: Pose, points: Sequence[tuple[float, float]]) -> bool:
+        """Whether a line may be the new stretch: gates are asked until it has been seen."""
+        if not self._gates or self.sights:
+            return True
+        line = [pose.floor(*point) for point in points]
+        return any(passes(line, gate, GATE_ASIDE, GATE_TURN) for gate in self._gates)
+
+    def _see_instead_of_plan(self, pose: Pose, points: Sequence[tuple[float, float]]) -> None:
+        """What was planned for where the line is now seen is planned no more."""
+        if len(self._planned):
+            cos, sin = math.cos(pose.heading), math.sin(pose.heading)
+            x = (self._planned[:, 0] - pose.x) * cos + (self._planned[:, 1] - pose.y) * sin
+            y = (self._planned[:, 1] - pose.y) * cos - (self._planned[:, 0] - pose.x) * sin
+            self._planned = self._planned[~((x > points[0][0] - 0.06) & (np.abs(y - points[0][1]) < 1.0))]
+
+    def _contradicts(self, pose: Pose, points: Sequence[tuple[float, float]]) -> bool:
+        off = []
+        for x, y in points:
+            fit = self.fit(pose, x, 0.12, planned=False)
+            if fit is not None:
+                off.append(abs(fit.y - y) * math.cos(fit.heading))
+        return len(off) >= 2 and sorted(off)[len(off) // 2] > OTHER
+
+    def _note_end(self, pose: Pose, end: End) -> None:
+        self._ends.append((end.kind, *pose.floor(end.x, end.y)))
+
+    # Giving out
+
+    @property
+    def end(self) -> tuple[TrackEnd, float, float] | None:
+        """Kind and place (m) of the end of this stretch, None when none was seen."""
+        if not self._ends:
+            return None
+        kind = self._ends[-1][0]
+        same = [(x, y) for k, x, y in self._ends if k is kind]
+        return kind, sum(x for x, _ in same) / len(same), sum(y for _, y in same) / len(same)
+
+    @property
+    def end_place(self) -> tuple[float, float] | None:
+        """Where the line ends, or how far it is known if no end was seen (m)."""
+        end = self.end
+        return (end[1], end[2]) if end is not None else self.tip
+
+    def ahead(self, pose: Pose) -> float:
+        """How far ahead (m) the line is known, up to its end if that was seen; negative when that lies behind."""
+        place = self.end_place
+        if place is None:
+            return 0.0
+        x, y = pose.body(*place)
+        return math.copysign(math.hypot(x, y), x) if abs(x) < 0.3 else (x if x < 0.0 else math.hypot(x, y))
+
+    def fit(self, pose: Pose, x: float, reach: float = REACH, *, planned: bool = True) -> Fit | None:
+        """The line `x` m ahead of a pose, from the points within `reach` of it; None where there are too few."""
+        near = self._near(pose, x, reach, planned)
+        if near is None:
+            return None
+        d, y, w = near
+        spread = float(d.max() - d.min())
+        if spread < 0.25 * reach:
+            return None
+        degree = 2 if spread > 0.8 * reach and d.min() < 0.3 * reach and d.max() > -0.3 * reach else 1
+        return _weighted(d, y, w, degree)
+
+    def _near(self, pose: Pose, x: float, reach: float, planned: bool) -> tuple[Vector, Vector, Vector] | None:
+        """Distances from the place, y and weights of the points that bear on it."""
+        seen = self._points[: min(self._count, CAPACITY)]
+        points = np.concatenate((seen, self._planned)) if planned and len(self._planned) else seen
+        if len(points) < NEEDED:
+            return None
+        cos, sin = math.cos(pose.heading), math.sin(pose.heading)
+        dx, dy = points[:, 0] - pose.x, points[:, 1] - pose.y
+        d = dx * cos + dy * sin - x
+        y = dy * cos - dx * sin
+        keep = (np.abs(d) < reach) & (np.abs(y) < 0.7)
+        if int(keep.sum()) < NEEDED:
+            return None
+        d, y = d[keep], y[keep]
+        part = 1.0 - (d / reach) ** 2
+        weights: Vector = points[keep, 2] * part * part
+        return d, y, weights
+
+
+def _weighted(d: Vector, y: Vector, w: Vector, degree: int) -> Fit | None:
+    """Weighted least squares about d = 0, by normal equations: three unknowns at most."""
+    wd = w * d
+    s0, s1, s2 = float(w.sum()), float(wd.sum()), float(wd @ d)
+    t0, t1 = float(w @ y), float(wd @ y)
+    if degree == 1:
+        determinant = s0 * s2 - s1 * s1
+        if determinant <= 1e-12:
+            return None
+        return Fit((t0 * s2 - t1 * s1) / determinant, (s0 * t1 - s1 * t0) / determinant, 0.0)
+    dd = d * d
+    s3, s4, t2 = float(wd @ dd), float((w * dd) @ dd), float((w * dd) @ y)
+    a = s2 * s4 - s3 * s3
+    b = s2 * s3 - s1 * s4
+    c = s1 * s3 - s2 * s2
+    determinant = s0 * a + s1 * b + s2 * c
+    if abs(determinant) < 1e-15:
+        return None
+    value = (t0 * a + t1 * b + t2 * c) / determinant
+    slope = (t0 * b + t1 * (s0 * s4 - s2 * s2) + t2 * (s1 * s2 - s0 * s3)) / determinant
+    half_bend = (t0 * c + t1 * (s1 * s2 - s0 * s3) + t2 * (s0 * s2 - s1 * s1)) / determinant
+    return Fit(value, slope, 2.0 * half_bend)
