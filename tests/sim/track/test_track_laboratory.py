@@ -255,6 +255,7 @@ def test_a_seed_gives_one_run(rover_bench: Bench) -> None:
     assert digest(rover_bench, 3, False) != digest(rover_bench, 4, False)
 
 
+@pytest.mark.processes
 def test_a_seed_gives_one_run_in_another_process(rover_bench: Bench) -> None:
     program = (
         "import json, sys\n"

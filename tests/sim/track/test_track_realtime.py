@@ -20,10 +20,14 @@ import pytest
 from services.comm.caller import Caller
 from services.comm.camera import StreamImages
 from services.comm.can_ports import StreamPort
+from services.comm.cell import Delays
 from services.comm.client import Client
 from services.comm.directory import load
-from services.comm.messages import Hello, Outcome
+from services.comm.lockstep import Member
+from services.comm.messages import Call, Hello, Outcome
+from services.comm.party import Envelope
 from sim.realtime import LaboratoryShell, bus_channel, camera_address
+from sim.track import Track
 from sim.track_laboratory import TrackLaboratory
 from sim.truth import LaboratoryError
 
@@ -167,6 +171,7 @@ def test_what_makes_no_laboratory_is_refused(tmp_path: Path, monkeypatch: pytest
         LaboratoryShell(load(services_file(tmp_path, "odd_laboratory:make")), "laboratory")
 
 
+@pytest.mark.processes
 def test_as_a_process_it_serves_until_told_to_end(tmp_path: Path) -> None:
     file = services_file(tmp_path)
     directory = load(file)
@@ -185,3 +190,50 @@ def test_as_a_process_it_serves_until_told_to_end(tmp_path: Path) -> None:
         assert process.wait(PATIENCE) == 0
         if process.stdout is not None:
             process.stdout.close()
+
+
+class Looker:
+    """A party that asks for a new experiment and its score, and ends the cell when it has that."""
+
+    name = "coordinator"
+
+    def __init__(self) -> None:
+        self.score: dict[str, Any] = {}
+        hello = Hello(1, 99, "coordinator", self.name, "boot")
+        prepare = Call("1", "laboratory_prepare", {"seed": 6, "regime": "contest"})
+        self._out: list[Any] = [hello, prepare, Call("2", "laboratory_score")]
+
+    def receive(self, now: float, envelope: Envelope) -> None:
+        if isinstance(envelope.body, Outcome) and envelope.body.id == "2":
+            self.score = dict(envelope.body.values)
+
+    def advance(self, now: float) -> None:
+        pass
+
+    def drain(self) -> list[Envelope]:
+        out, self._out = self._out, []
+        return [Envelope("laboratory", self.name, "laboratory", "call", body) for body in out]
+
+
+@pytest.mark.processes
+def test_it_is_a_member_of_a_lock_step_cell(tmp_path: Path) -> None:
+    file = services_file(tmp_path)
+    text = file.read_text()
+    port = text.split("[nodes.drive]")[1].split("port = ")[1].split()[0]
+    alone = text[: text.index("[nodes.drive]")] + text[text.index("[services.laboratory_prepare]") :]
+    file.write_text(f'{alone}[coordinator]\nhost = "127.0.0.1"\nport = {port}\n')
+    directory = load(file)
+    process = subprocess.Popen([sys.executable, "-m", "sim", "--services", str(file), "--lockstep"], cwd=REPOSITORY)
+    looker = Looker()
+    member = Member(
+        "coordinator", [looker], directory.members(), delays=Delays({}), directory=directory.hash, patience=PATIENCE
+    )
+    try:
+        member.open()
+        member.run(lambda: bool(looker.score), 1000)
+        assert looker.score["regime"] == "contest"
+        assert looker.score["track"] == Track.contest().plain()
+        assert process.wait(PATIENCE) == 0
+    finally:
+        process.kill()
+        process.wait(PATIENCE)
