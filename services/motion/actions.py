@@ -137,17 +137,20 @@ class _Following:
         why = await self._renew()
         if why:
             return _trouble(ctx.device.state) or error("refused", why)
-        begun = ctx.now
-        while ctx.now - begun <= timeout:
+        begun, seen, result = ctx.now, -1, None
+
+        def judged() -> bool:
+            nonlocal seen, result
             state = ctx.device.state
-            result = _trouble(state) or judge(state, ctx.now - begun)
-            if result is not None:
-                return result
-            seen = state["cycles"]
-            await ctx.wait(lambda seen=seen: ctx.device.state["cycles"] != seen, RENEW)  # type: ignore[misc]
-            if ctx.now - self._renewed >= RENEW:
-                await self._renew()
-        return error("arm_timeout", f"nothing came of following in {timeout} s")
+            if state["cycles"] != seen:
+                seen, result = state["cycles"], _trouble(state) or judge(state, ctx.now - begun)
+            return result is not None
+
+        while ctx.now - begun <= timeout:
+            if await ctx.wait(judged, min(self._renewed + RENEW, begun + timeout) - ctx.now):
+                break
+            await self._renew()
+        return result or error("arm_timeout", f"nothing came of following in {timeout} s")
 
     async def _renew(self) -> str:
         self._renewed = self._ctx.now

@@ -7,6 +7,7 @@ of their own kind; time, cameras and the question which candidate is the ball (`
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -127,13 +128,17 @@ class BackgroundSubtraction(_WholeTable):
         super().__init__(view)
         self._background = background
         self._window = Window(view)
+        self._halved: Pixels | None = None
+        self._half_picture: Pixels = np.empty((0, 0), np.uint8)
 
     def detect(self, pixels: Pixels) -> Array:
         """Candidates, refined to parts of a pixel; none before the background is known."""
         picture = self._background.picture
         if picture is None or not self._background.known:
             return NOTHING
-        brighter = cv2.subtract(self.half(pixels), self.half(picture))
+        if picture is not self._halved:  # a new one each time it learns
+            self._halved, self._half_picture = picture, self.half(picture)
+        brighter = cv2.subtract(self.half(pixels), self._half_picture)
         mask = cv2.threshold(brighter, self.THRESHOLD, 255, cv2.THRESH_BINARY)[1]
         found = []
         for centre in self.blobs(np.asarray(mask, np.uint8)):
@@ -284,11 +289,13 @@ class Window:
         self, area: NDArray[Any], centres: Array, middle: Array, smallest: float, largest: float, spread: float
     ) -> int | None:
         """The region of a whole ball's area that is nearest to the expected place."""
-        away = np.hypot(centres[:, 0] - middle[0], centres[:, 1] - middle[1])
-        good = (area > self.LEAST_COVER * smallest) & (area < self.MOST_COVER * largest) & (away <= spread)
-        if not good.any():
-            return None
-        return int(np.argmin(np.where(good, away, np.inf)))
+        (u, v), best, least = middle.tolist(), None, math.inf
+        low, high = self.LEAST_COVER * smallest, self.MOST_COVER * largest
+        for number, (size, (x, y)) in enumerate(zip(area.tolist(), centres.tolist(), strict=True)):
+            away = math.hypot(x - u, y - v)
+            if low < size < high and away <= spread and away < least:
+                best, least = number, away
+        return best
 
     def _centroid(
         self, cover: NDArray[np.float32], mine: NDArray[np.bool_], stats: NDArray[Any], box: tuple[slice, slice]

@@ -54,21 +54,41 @@ class Optics:
 
     def project(self, points: ArrayLike) -> Array:
         """Pixels (..., 2) of points (..., 3) before the camera."""
-        seen = (np.asarray(points, float) - self.position) @ self.rotation.T
+        at = np.asarray(points, float)
+        if at.ndim == 1:
+            return np.array(self._pixel(*at.tolist()))
+        seen = (at - self.position) @ self.rotation.T
         x, y = seen[..., 0] / seen[..., 2], seen[..., 1] / seen[..., 2]
         bent_x, bent_y, *_ = self._bend(x, y)
         return np.stack([self.focal[0] * bent_x + self.centre[0], self.focal[1] * bent_y + self.centre[1]], axis=-1)
 
+    def _pixel(self, px: float, py: float, pz: float) -> tuple[float, float]:
+        """One point, as in tracking: plain floats are much faster than arrays without dimension."""
+        ox, oy, oz = self.position.tolist()
+        (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = self.rotation.tolist()
+        dx, dy, dz = px - ox, py - oy, pz - oz
+        depth = dx * zx + dy * zy + dz * zz
+        bent_x, bent_y, *_ = self._bend((dx * xx + dy * xy + dz * xz) / depth, (dx * yx + dy * yy + dz * yz) / depth)
+        return self.focal[0] * bent_x + self.centre[0], self.focal[1] * bent_y + self.centre[1]
+
+    def _place(self, u: float, v: float, z: float) -> tuple[float, float]:
+        """One pixel through the plane."""
+        x, y = self._straighten((u - self.centre[0]) / self.focal[0], (v - self.centre[1]) / self.focal[1])
+        ox, oy, oz = self.position.tolist()
+        (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = self.rotation.tolist()
+        distance = (z - oz) / (x * xz + y * yz + zz)
+        return ox + distance * (x * xx + y * yx + zx), oy + distance * (x * xy + y * yy + zy)
+
     def to_plane(self, pixels: ArrayLike, z: float) -> Array:
         """Points (..., 2), x and y, where pixels (..., 2) look through the horizontal plane at height `z` (m)."""
         at = np.asarray(pixels, float)
-        bent_x, bent_y = (at[..., 0] - self.centre[0]) / self.focal[0], (at[..., 1] - self.centre[1]) / self.focal[1]
-        if at.ndim == 1:  # one point, as in tracking: plain floats are much faster than arrays without dimension
-            straight = np.array([*self._straighten(float(bent_x), float(bent_y)), 1.0])
-        else:
-            x, y = self._straighten(bent_x, bent_y)
-            straight = np.stack([x, y, np.ones_like(x)], axis=-1)
-        direction = straight @ self.rotation
+        if at.ndim == 1:
+            u, v = at.tolist()
+            return np.array(self._place(u, v, z))
+        x, y = self._straighten(
+            (at[..., 0] - self.centre[0]) / self.focal[0], (at[..., 1] - self.centre[1]) / self.focal[1]
+        )
+        direction = np.stack([x, y, np.ones_like(x)], axis=-1) @ self.rotation
         distance = (z - self.position[2]) / direction[..., 2]
         return np.asarray(self.position[:2] + distance[..., None] * direction[..., :2])
 

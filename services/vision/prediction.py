@@ -7,11 +7,12 @@ coefficient c is known to +-30 % only; sliding ends some tenths of a second afte
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +66,7 @@ class Surface:
         rolling = float(ball["rolling_resistance"]) * float(ball["gravity"])
         return cls(float(table["near_edge"]), float(table["width"]) / 2.0, rolling, spread / np.sqrt(3.0) * rolling)
 
-    def gap(self, place: Array, heading: Array) -> tuple[float, Way]:
+    def gap(self, place: Array, heading: Sequence[float] | Array) -> tuple[float, Way]:
         """Way along `heading` (2,) from `place` (2,) to the edge that comes first, and which one; inf when none does."""
         side = np.inf
         if abs(heading[1]) > 1e-9:
@@ -145,6 +146,19 @@ def _stays(place: Array, velocity: Array) -> Exit:
     return Exit(Way.STAYS, float("inf"), place, velocity, float("inf"), float("inf"))
 
 
+_PLACES = np.ix_((0, 4, 5), (0, 4, 5))
+"""Of a model's sums: weight, x and y."""
+
+
+class _Solution(NamedTuple):
+    """Heading (2,), each model's solution (m, 4), covariance (m, 4, 4) and weight (m,)."""
+
+    heading: tuple[float, float]
+    solution: Array
+    covariance: Array
+    weight: Array
+
+
 class LeastSquares:
     """Least squares over all places since the ball was first seen: a straight line in space; along it a start, a speed, the
     rolling deceleration (known to its prior), and sliding until one of several moments.
@@ -162,94 +176,102 @@ class LeastSquares:
         sigma = max(surface.rolling_sigma if rolling_sigma is None else rolling_sigma, 1e-6)
         self._prior = np.array([0.0, 0.0, sigma**-2.0, SLIDING_SIGMA**-2.0])
         self._mean = np.array([0.0, 0.0, surface.rolling, SLIDING])
-        models = len(self.MOMENTS)
-        self._A = np.zeros((models, 4, 4))
-        self._b = np.zeros((models, 4, 2))
-        self._weight = 0.0
-        self._sum = np.zeros(2)
-        self._squares = np.zeros((2, 2))
-        self._origin = np.zeros(3)
-        self._solved: tuple[Array, Array, Array, Array] | None = None
+        self._regular, self._drawn = np.diag(self._prior), self._prior * self._mean
+        self._sums = np.zeros((len(self.MOMENTS), 6, 6))
+        """Weighted sums of products of each model's row: start, speed, rolling, sliding, x, y."""
+        self._origin = (0.0, 0.0, 0.0)
+        self._solved: _Solution | None = None
         self.count = 0
 
     def _basis(self, t: float | Array) -> Array:
         """(models, 4) at one time or at each model's own: start, speed, rolling and sliding deceleration."""
-        rest = np.maximum(self.MOMENTS - t, 0.0)
-        basis = np.empty((len(rest), 4))
-        basis[:, 0], basis[:, 1], basis[:, 2], basis[:, 3] = 1.0, t, -0.5 * t * t, -0.5 * rest * rest
+        basis = np.empty((len(self.MOMENTS), 4))
+        self._fill(basis, t)
         return basis
+
+    def _fill(self, rows: Array, t: float | Array) -> None:
+        rest = np.maximum(self.MOMENTS - t, 0.0)
+        rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3] = 1.0, t, -0.5 * t * t, -0.5 * rest * rest
 
     def add(self, time: float, x: float, y: float, sigma: float | None = None) -> None:
         """Take a place (m) seen at a time (s) with a standard deviation (m)."""
         if self.count == 0:
-            self._origin = np.array([time, x, y])
-        t, place = time - self._origin[0], np.array([x, y]) - self._origin[1:]
-        weight = 1.0 if sigma is None else (self._surface.noise / sigma) ** 2
-        basis = self._basis(t)
-        self._A += weight * basis[:, :, None] * basis[:, None, :]
-        self._b += weight * basis[:, :, None] * place
-        self._weight += weight
-        self._sum += weight * place
-        self._squares += weight * np.outer(place, place)
+            self._origin = (time, x, y)
+        rows = np.empty((len(self.MOMENTS), 6))
+        self._fill(rows, time - self._origin[0])
+        rows[:, 4], rows[:, 5] = x - self._origin[1], y - self._origin[2]
+        products = rows[:, :, None] * rows[:, None, :]
+        self._sums += products if sigma is None else (self._surface.noise / sigma) ** 2 * products
         self.count += 1
         self._solved = None
 
-    def _heading(self) -> Array:
-        """Direction of the ball's straight way: principal axis of the places, turned the way the ball goes."""
-        scatter = self._squares - np.outer(self._sum, self._sum) / self._weight
-        axis = np.linalg.eigh(scatter)[1][:, 1]
-        # the speed's normal equation of the model without sliding says which way
-        t_mean = self._A[0, 0, 1] / self._weight
-        forward = (self._b[0, 1] - t_mean * self._b[0, 0]) @ axis
-        return np.asarray(axis if forward >= 0.0 else -axis)
+    def _middle(self) -> tuple[float, float]:
+        """Mean of the places, from the first one on."""
+        weight, x, y = self._sums[0, 0, (0, 4, 5)].tolist()
+        return x / weight, y / weight
 
-    def _solve(self) -> tuple[Array, Array, Array, Array]:
-        """Heading (2,), each model's solution (m, 4), covariance (m, 4, 4) and weight (m,)."""
+    def _scatter(self) -> tuple[float, float, float]:
+        """Sums of squares of the places about their mean: xx, xy, yy."""
+        (weight, x, y), (_, xx, xy), (_, _, yy) = self._sums[0][_PLACES].tolist()
+        return xx - x * x / weight, xy - x * y / weight, yy - y * y / weight
+
+    def _heading(self) -> tuple[float, float]:
+        """Direction of the ball's straight way: principal axis of the places, turned the way the ball goes."""
+        xx, xy, yy = self._scatter()
+        turn = 0.5 * math.atan2(2.0 * xy, xx - yy)
+        hx, hy = math.cos(turn), math.sin(turn)
+        # the speed's normal equation of the model without sliding says which way
+        (weight, t, x, y), (_, _, tx, ty) = self._sums[0, :2][:, (0, 1, 4, 5)].tolist()
+        forward = (tx - t / weight * x) * hx + (ty - t / weight * y) * hy
+        return (hx, hy) if forward >= 0.0 else (-hx, -hy)
+
+    def _solve(self) -> _Solution:
         if self._solved is None:
             heading, precision = self._heading(), self._surface.noise**-2.0
-            P = self._A * precision + np.diag(self._prior)
-            b = (self._b @ heading) * precision + self._prior * self._mean
+            P = self._sums[:, :4, :4] * precision + self._regular
+            b = (self._sums[:, :4, 4:] @ heading) * precision + self._drawn
             covariance = np.linalg.inv(P)
-            solution = np.einsum("mij,mj->mi", covariance, b)
+            solution = (covariance @ b[:, :, None])[:, :, 0]
             # evidence of a linear model with Gaussian prior; the terms that all models share are left out
-            evidence = 0.5 * (np.einsum("mi,mi->m", solution, b) - np.linalg.slogdet(P)[1])
+            evidence = 0.5 * ((solution * b).sum(axis=1) - np.linalg.slogdet(P)[1])
             lost = solution[:, 3] * self.MOMENTS / np.maximum(solution[:, 1], 0.05)
             evidence -= 0.5 * np.square(np.maximum(lost - LARGEST_LOSS, 0.0) / LOSS_SIGMA)
             weight = np.exp(evidence - evidence.max())
-            self._solved = heading, solution, covariance, weight / weight.sum()
+            self._solved = _Solution(heading, solution, covariance, weight / weight.sum())
         return self._solved
 
     def place(self, time: float) -> Array:
         """Where the ball is expected (2,) m."""
-        heading, solution, _, weight = self._solve()
-        t = time - self._origin[0]
-        along = float(weight @ np.einsum("mi,mi->m", self._basis(t), solution))
-        middle = self._sum / self._weight
-        return np.asarray(self._origin[1:] + middle + heading * (along - middle @ heading))
+        (hx, hy), solution, _, weight = self._solve()
+        along = float(weight @ (self._basis(time - self._origin[0]) * solution).sum(axis=1))
+        x, y = self._middle()
+        ahead = along - (x * hx + y * hy)
+        return np.array([self._origin[1] + x + hx * ahead, self._origin[2] + y + hy * ahead])
 
     def exit(self) -> Exit | None:
         """How it leaves the table."""
         if self.count < 3:
             return None
         heading, solution, covariance, weight = self._solve()
-        middle = self._sum / self._weight
-        gap, way = self._surface.gap(self._origin[1:] + middle, heading)
+        x, y = self._middle()
+        middle = np.array([self._origin[1] + x, self._origin[2] + y])
+        gap, way = self._surface.gap(middle, heading)
         if way is Way.STAYS:
-            return _stays(self._origin[1:] + middle, np.zeros(2))
-        along = gap + float(middle @ heading)
+            return _stays(middle, np.zeros(2))
+        along = gap + x * heading[0] + y * heading[1]
         ahead, speed, variance = self._arrivals(along, solution, covariance)
         usual = np.isfinite(ahead)
         if weight @ usual < 0.5:
-            return _stays(self._origin[1:] + middle, np.zeros(2))
+            return _stays(middle, np.zeros(2))
         weight, ahead, speed = weight[usual] / weight[usual].sum(), ahead[usual], speed[usual]
         mean = float(weight @ ahead)
         sigma = float(np.sqrt(weight @ (variance[usual] + (ahead - mean) ** 2)))
         facing = abs(heading[0] if way is Way.NEAR_EDGE else heading[1])
         return Exit(
             way,
-            float(self._origin[0]) + mean,
-            self._origin[1:] + middle + gap * heading,
-            heading * float(weight @ speed),
+            self._origin[0] + mean,
+            middle + gap * np.array(heading),
+            np.array(heading) * float(weight @ speed),
             sigma,
             self._place_sigma(heading, gap) / facing,
         )
@@ -262,12 +284,14 @@ class LeastSquares:
         ahead = np.where((under > 0.0) & (speed > 0.0), 2.0 * (along - start) / np.maximum(speed + last, 1e-6), np.inf)
         t = np.where(np.isfinite(ahead), ahead, 0.0)
         slope = self._basis(t)
-        return ahead, last, np.einsum("mi,mij,mj->m", slope, covariance, slope) / last**2
+        variance = ((covariance @ slope[:, :, None])[:, :, 0] * slope).sum(axis=1)
+        return ahead, last, variance / last**2
 
-    def _place_sigma(self, heading: Array, gap: float) -> float:
+    def _place_sigma(self, heading: tuple[float, float], gap: float) -> float:
         """Standard deviation, across the way, of the point `gap` m beyond the middle of the places."""
-        scatter = heading @ (self._squares - np.outer(self._sum, self._sum) / self._weight) @ heading
-        return self._surface.noise * float(np.sqrt(1.0 / self._weight + gap * gap / max(float(scatter), 1e-9)))
+        (hx, hy), (xx, xy, yy) = heading, self._scatter()
+        scatter = xx * hx * hx + 2.0 * xy * hx * hy + yy * hy * hy
+        return self._surface.noise * math.sqrt(1.0 / float(self._sums[0, 0, 0]) + gap * gap / max(scatter, 1e-9))
 
 
 class Kalman:

@@ -51,6 +51,8 @@ class TableView:
     def to_pixels(self, places: ArrayLike) -> Array:
         """Pixels (..., 2) of a rolling ball's centre at x and y (..., 2), m."""
         at = np.asarray(places, float)
+        if at.ndim == 1:
+            return self.optics.project((*at.tolist(), self.height))
         return self.optics.project(np.concatenate([at, np.full((*at.shape[:-1], 1), self.height)], axis=-1))
 
     def on_table(self, places: ArrayLike, margin: float = 0.0) -> NDArray[np.bool_]:
