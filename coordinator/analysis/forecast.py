@@ -146,7 +146,7 @@ class Forecast:
             for name, rate in zip(gspn.net.transitions, gspn.rate, strict=True)
             if rate is not None
             and name not in self.view.origin
-            and name.startswith(tuple(f"{place}.{s}." for s in Status))
+            and name.startswith((f"{place}.by.", *(f"{place}.{s}." for s in Status)))
         ]
 
     def _use(self, keys: list[tuple[str, str]]) -> dict[tuple[str, str], float]:

@@ -9,7 +9,7 @@ flushed at once, and a repeated run draws afresh.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
@@ -35,13 +35,16 @@ class Measured:
 
     `runs[(place or primitive task, action)]` gives share, mean (s) and cv by status; `choice[primitive task][action]` the
     current probability of each alternative; `waits[event]` the mean wait (s) of a transition for it; `switches[transition]`
-    the relative frequency of a condition among the transitions that compete with it.
+    the relative frequency of a condition among the transitions that compete with it. `preempted[(place, action)]` gives share, mean
+    and cv of the runs that each transition preempted; where all actions of a place have it, the preempting event is one of the
+    causes by which a run ends (its shares and those of `runs` sum to 1), not an independent race.
     """
 
     runs: Mapping[tuple[str, str], Mapping[Status, Estimate]] = field(default_factory=dict)
     choice: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     waits: Mapping[str, float] = field(default_factory=dict)
     switches: Mapping[str, float] = field(default_factory=dict)
+    preempted: Mapping[tuple[str, str], Mapping[str, Estimate]] = field(default_factory=dict)
 
 
 class NoEstimate(ValueError):  # noqa: N818 - names what is missing
@@ -103,6 +106,7 @@ class _Derivation:
         self.errors: dict[str, float] = {}
         self.possible: dict[str, set[Status]] = {}
         self.phases: dict[str, list[str]] = {}
+        self.by: dict[tuple[str, str], str] = {}
         for place in task.places.values():
             if place.kind is Kind.ACTION:
                 self._action_place(place)
@@ -136,7 +140,10 @@ class _Derivation:
             self.places[f"{name}.server"] = place.servers
         self.possible[name], self.phases[name] = set(), []
         laws: dict[tuple[Status, PhaseType], list[tuple[str, float]]] = {}
-        for action, chosen in self._alternatives(place).items():
+        alternatives = self._alternatives(place)
+        if alternatives and all((name, action) in self.measured.preempted for action in alternatives):
+            self._causes(place, alternatives)
+        for action, chosen in alternatives.items():
             self._choice(place, action, chosen)
             for status, estimate in self._estimates(place, action).items():
                 if estimate.share > 0:
@@ -151,6 +158,33 @@ class _Derivation:
             )
         if preempted:
             self._flush(name)
+
+    def _causes(self, place: Place, actions: Iterable[str]) -> None:
+        """Preemption as a cause by which a run ends: `p.by.t` waits for t to take the run, which goes on until then."""
+        name = place.name
+        for t in self.task.transitions.values():
+            if any(a.place == name and a.end is End.PREEMPT for a in t.inputs):
+                self.by[name, t.name] = f"{name}.by.{t.name}"
+                self.places[f"{name}.by.{t.name}"] = 0
+                self.phases[name].append(f"{name}.by.{t.name}")
+        for action in actions:
+            for transition, estimate in self.measured.preempted[name, action].items():
+                if estimate.share > 0 and (name, transition) in self.by:
+                    self._cause(name, action, transition, estimate)
+
+    def _cause(self, name: str, action: str, transition: str, estimate: Estimate) -> None:
+        """The draw of a preemption and the phases of the time until it comes."""
+        key, end = f"{name}.{action}.by.{transition}", self.by[name, transition]
+        law = self._law(key, estimate.mean, (estimate.cv * estimate.mean) ** 2, self.stages)
+        for i, branch in enumerate(law.branches):
+            chain = [f"{end}.{action}{'abc'[i]}{k}" for k in range(1, branch.stages + 1)]
+            self.places |= dict.fromkeys(chain, 0)
+            self.phases[name] += chain
+            self._immediate(
+                f"{key} {i + 1}", {f"{name}.{action}": 1}, {chain[0]: 1}, estimate.share * branch.probability, CHOICE
+            )
+            for phase, following in zip(chain, [*chain[1:], end], strict=True):
+                self._timed(phase, {phase: 1}, {following: 1}, branch.rate)
 
     def _alternatives(self, place: Place) -> dict[str, float]:
         primitive = self.task.primitive_task_of(place.name)
@@ -257,7 +291,7 @@ class _Derivation:
                 for suffix in ("begin", "going"):
                     base_give[f"{output.place}.{suffix}"] = output.weight
         out = []
-        for combination in product(*(self._takings(arc) for arc in t.inputs if arc.end is not None)):
+        for combination in product(*(self._takings(t, arc) for arc in t.inputs if arc.end is not None)):
             taken = [(place, status) for place, status, _, _ in combination if status is not None]
             if not self._may_hold(t, dict(taken)):
                 continue
@@ -269,11 +303,12 @@ class _Derivation:
             out.append((need, give))
         return out
 
-    def _takings(self, arc: Input) -> list[tuple[str, Status | None, Weights, Weights]]:
+    def _takings(self, t: Transition, arc: Input) -> list[tuple[str, Status | None, Weights, Weights]]:
         """The ways in which an arc may take its runs: (place, status if all have one, taken, given back)."""
         p, w = arc.place, arc.weight
         if arc.end is End.PREEMPT:
-            return [(p, None, {f"{p}.going": w}, {})]
+            cause = {self.by[p, t.name]: 1} if (p, t.name) in self.by else {}
+            return [(p, None, {f"{p}.going": w, **cause}, {})]
         if arc.end is End.GOING:
             return [(p, None, {f"{p}.going": w}, {f"{p}.going": w})]
         if arc.end is End.ERROR:
@@ -300,7 +335,9 @@ class _Derivation:
     def _fires(self, t: Transition, name: str, need: Weights, give: Weights) -> None:
         """How the case fires: after a delay, with its events, or at once."""
         share = self._switch(t)
-        if t.after is not None:
+        if any((a.place, t.name) in self.by for a in t.inputs):
+            self._immediate(name, need, give, 1.0, TASK + t.priority)
+        elif t.after is not None:
             self._timer(t, name, need, give)
         elif t.events:
             self._timed(name, need, give, share / self._wait(t), 1)

@@ -23,9 +23,10 @@ from coordinator.learning.rule import forced, one_hot
 class NikolicFu:
     """The paper's scheme. gamma_k = min(1, c / (k + k0)^exponent), k = 1, 2, ...
 
-    With `mixing` m > 0 the draw is from (1 - eps_k) p + eps_k / n, eps_k = min(1, m n / k); each action is chosen `trials`
-    times before that. The textbook gain has exponent 1, 0 < c <= 1 and no mixing; docs/learning.md says which parameters
-    converge with probability 1.
+    With `mixing` m > 0 the draw is from (1 - eps_k) p + eps_k e, eps_k = min(1, m n / k); each action is chosen `trials`
+    times before that. e explores: a share `even` over all actions alike, the rest over the contenders, those whose J less
+    `focus` standard errors is not above what some action's J plus as many is. The textbook gain has exponent 1, 0 < c <= 1
+    and no mixing; docs/learning.md says which parameters converge with probability 1.
     """
 
     name: str = "nikolic_fu"
@@ -34,6 +35,8 @@ class NikolicFu:
     exponent: float = 1.0
     mixing: float = 0.0
     trials: int = 0
+    even: float = 1.0
+    focus: float = 2.0
 
     def begin(self, rows: int, n: int, rho: float | None = None) -> Batch:
         """All actions equally likely."""
@@ -41,7 +44,8 @@ class NikolicFu:
 
     def gain(self, k: Array) -> Array:
         """gamma at the k-th trial."""
-        return np.minimum(1.0, self.c / (k + self.k0) ** self.exponent)
+        gamma: Array = np.minimum(1.0, self.c / (k + self.k0) ** self.exponent)
+        return gamma
 
     def exploration(self, batch: Batch) -> Array:
         """eps of the next trial, shape (rows, 1)."""
@@ -50,12 +54,22 @@ class NikolicFu:
         eps: Array = np.minimum(1.0, self.mixing * batch.n / (batch.k + 1.0))[:, None]
         return eps
 
+    def explored(self, batch: Batch) -> Array:
+        """Shares of the actions in exploration, shape (rows, n)."""
+        if self.even >= 1.0:
+            return np.full_like(batch.p, 1.0 / batch.n)
+        j, error = batch.objective(), self.focus * batch.spread()
+        contends = j - error <= np.min(j + error, axis=1, keepdims=True)
+        contends |= np.isinf(j)
+        shares: Array = contends / contends.sum(axis=1, keepdims=True)
+        return self.even / batch.n + (1.0 - self.even) * shares
+
     def probabilities(self, batch: Batch, offered: Mask) -> Array:
         """p with its share of exploration; certain while an action is still owed its first trials."""
+        if not self.mixing:
+            return restricted(batch.p, offered)
         eps = self.exploration(batch)
-        mixed = restricted((1 - eps) * batch.p + eps / batch.n, offered)
-        if not self.trials:
-            return mixed
+        mixed = restricted((1 - eps) * batch.p + eps * self.explored(batch), offered)
         owed, least = forced(batch, offered, self.trials)
         return np.where(owed[:, None], one_hot(least, batch.n), mixed)
 

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Index = NDArray[np.intp]
 
-SUMS = ("tries", "runs", "successes", "cost", "costed", "missing")
+SUMS = ("tries", "runs", "successes", "cost", "squares", "costed", "missing")
 
 
 @dataclass
@@ -49,6 +49,8 @@ class Batch:
     successes: Array
     cost: Array
     """Sum of the costs of the runs that have one."""
+    squares: Array
+    """Sum of their squares."""
     costed: Array
     """Runs that have a cost."""
     missing: Array
@@ -63,8 +65,9 @@ class Batch:
         """Nothing known, all actions equally likely."""
         if n < 1 or rows < 1:
             raise ValueError(f"{rows} learners over {n} actions: at least one of each is needed")
-        tries, runs, successes, cost, costed, missing = (np.zeros((rows, n)) for _ in SUMS)
-        return cls(np.full((rows, n), 1.0 / n), np.zeros(rows), tries, runs, successes, cost, costed, missing, rho)
+        tries, runs, successes, cost, squares, costed, missing = (np.zeros((rows, n)) for _ in SUMS)
+        p = np.full((rows, n), 1.0 / n)
+        return cls(p, np.zeros(rows), tries, runs, successes, cost, squares, costed, missing, rho)
 
     @property
     def n(self) -> int:
@@ -82,7 +85,9 @@ class Batch:
         known = executed * ~np.isnan(trial.cost)
         self.runs[rows, trial.action] += executed
         self.successes[rows, trial.action] += executed * trial.success
-        self.cost[rows, trial.action] += np.where(known > 0, trial.cost, 0.0)
+        cost = np.where(known > 0, trial.cost, 0.0)
+        self.cost[rows, trial.action] += cost
+        self.squares[rows, trial.action] += cost * cost
         self.costed[rows, trial.action] += known
         self.missing[rows, trial.action] += 1 - executed
         self.k += 1
@@ -113,6 +118,15 @@ class Batch:
         """J = 1 - A R + rho C of each action; inf where it was never tried."""
         j = 1.0 - self.availability() * self.reliability() + self.weight() * self.mean_cost()
         return np.where(self.runs + self.missing > 0, j, np.inf)
+
+    def spread(self) -> Array:
+        """Standard error of J: of R with one success and one failure added, so that it is never 0, and of rho C."""
+        n = np.maximum(self.runs, 1.0)
+        share = (self.successes + 1.0) / (self.runs + 2.0)
+        costed = np.maximum(self.costed, 1.0)
+        scatter = np.maximum(0.0, self.squares / costed - (self.cost / costed) ** 2)
+        error: Array = np.sqrt(share * (1.0 - share) / n + self.weight() ** 2 * scatter / costed)
+        return error
 
     def best(self, eligible: Mask | None = None) -> Index:
         """The action with the lowest J in each row, of the eligible ones if any is; the first of equals."""

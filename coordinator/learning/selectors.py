@@ -13,7 +13,7 @@ import numpy as np
 
 from coordinator.learning.automata import DiscretisedPursuit, NikolicFu, RewardInaction
 from coordinator.learning.bandits import UCB1, Thompson
-from coordinator.learning.batch import Batch, Mask, Trial
+from coordinator.learning.batch import SUMS, Batch, Mask, Trial
 from coordinator.learning.estimate import Observation, Tally
 from coordinator.learning.objective import Question
 from coordinator.learning.rule import Rule
@@ -24,7 +24,9 @@ from coordinator.task import Executed, Status
 
 RULES: Mapping[str, Callable[[], Rule]] = {
     "nikolic_fu": NikolicFu,
-    "nikolic_fu_fast": lambda: NikolicFu("nikolic_fu_fast", k0=0.0, exponent=0.7, mixing=5.0, trials=5),
+    "nikolic_fu_fast": lambda: NikolicFu(
+        "nikolic_fu_fast", k0=0.0, exponent=0.5, mixing=20.0, trials=5, even=0.2, focus=1.5
+    ),
     "tracking": Tracking,
     "reward_inaction": RewardInaction,
     "discretised_pursuit": DiscretisedPursuit,
@@ -184,6 +186,7 @@ class RuleSelector:
             cost, missing = tally.cost(self.question.measure), sum(tally.not_executed.values())
             batch.runs[0, i], batch.successes[0, i] = tally.runs, tally.count(Status.SUCCESS)
             batch.cost[0, i], batch.costed[0, i] = cost.total, cost.n
+            batch.squares[0, i] = cost.m2 + cost.n * cost.mean**2
             batch.missing[0, i] = missing
             batch.tries[0, i] = max(batch.tries[0, i], tally.runs + missing)
 
@@ -223,7 +226,7 @@ class RuleSelector:
         pairs = [(i, actions.index(a)) for i, a in enumerate(self.actions) if a in actions]
         kept = sum(old.p[0, j] for _, j in pairs)
         for i, j in pairs:
-            for name in ("tries", "runs", "successes", "cost", "costed", "missing"):
+            for name in SUMS:
                 getattr(batch, name)[0, i] = getattr(old, name)[0, j]
             if kept > 0:
                 batch.p[0, i] = old.p[0, j] / kept * len(pairs) / batch.n

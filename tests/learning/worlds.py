@@ -1,0 +1,99 @@
+"""Bernoulli worlds with known J, and rules played in many of them side by side: the convergence study of docs/learning.md."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from coordinator.learning.batch import Array, Batch, Index, Trial
+from coordinator.learning.rule import Rule
+
+
+@dataclass(frozen=True)
+class World:
+    """Reliability and mean cost of each action; from `change` on (trials) those of `later`."""
+
+    name: str
+    reliability: tuple[float, ...]
+    cost: tuple[float, ...]
+    change: int | None = None
+    later: tuple[float, ...] = ()
+
+    @property
+    def n(self) -> int:
+        """Actions."""
+        return len(self.reliability)
+
+    def at(self, trial: int) -> World:
+        """The world at a trial (from 0), without its future."""
+        if self.change is None or trial < self.change:
+            return replace(self, change=None)
+        return replace(self, reliability=self.later, change=None)
+
+    def objective(self) -> Array:
+        """J of each action with rho = 1 / max C."""
+        cost = np.array(self.cost)
+        rho = 1.0 / cost.max() if cost.max() > 0 else 0.0
+        return 1.0 - np.array(self.reliability) + rho * cost
+
+    @property
+    def gap(self) -> float:
+        """Difference of the two lowest J."""
+        low = np.sort(self.objective())
+        return float(low[1] - low[0])
+
+
+def gapped(gap: float, best: float = 0.9, n: int = 4) -> World:
+    """One action of reliability `best`, all others `gap` worse; equal costs."""
+    return World(f"gap {gap:g}", (best - gap, *([best - gap] * (n - 2)), best), (1.0,) * n)
+
+
+@dataclass
+class Played:
+    """What came of it: arrays over seeds (rows)."""
+
+    batch: Batch
+    regret: Array
+    """Cumulative regret in J at each checkpoint, shape (checkpoints, rows)."""
+    optimal: Array
+    """Share of the last hundred choices that were optimal, by row."""
+    p_best: Array
+    """p of the optimum at each checkpoint, shape (checkpoints, rows)."""
+    checkpoints: Sequence[int]
+
+
+def play(
+    rule: Rule,
+    world: World,
+    trials: int,
+    seeds: int,
+    rng: np.random.Generator,
+    checkpoints: Sequence[int] = (),
+    watch: Callable[[int, Batch, Index], None] | None = None,
+) -> Played:
+    """Play a rule in `seeds` copies of a world; each row has uniform numbers of its own."""
+    batch, n, rows = rule.begin(seeds, world.n), world.n, np.arange(seeds)
+    offered = np.ones((seeds, n), dtype=bool)
+    marks = list(checkpoints) or [trials]
+    total, regret, p_best = np.zeros(seeds), [], []
+    recent = np.zeros((100, seeds))
+    executed = np.ones(seeds, dtype=bool)
+    for t in range(trials):
+        now = world.at(t)
+        j = now.objective()
+        action = rule.choose(batch, offered, rng.random((seeds, n)))
+        batch.choosing(action)
+        success = (rng.random(seeds) < np.array(now.reliability)[action]).astype(float)
+        cost = np.array(now.cost)[action] * rng.gamma(10.0, 0.1, seeds)
+        rule.learn(batch, Trial(action, success, cost, executed))
+        total += j[action] - j.min()
+        recent[t % 100] = j[action] <= j.min() + 1e-12
+        if watch is not None:
+            watch(t, batch, action)
+        if t + 1 in marks:
+            regret.append(total.copy())
+            p_best.append(batch.p[:, j <= j.min() + 1e-12].sum(axis=1))
+    optimal = recent[: min(trials, 100)].mean(axis=0)
+    return Played(batch, np.array(regret), optimal, np.array(p_best), marks)
