@@ -258,6 +258,12 @@ def _exported(task: Task, target: Path, stages: int) -> tuple[NetFile, list[str]
     if target.suffix == ".drn":
         view = stochastic_view(task, stages=stages, timer_stages=stages)
         return NetFile(view.gspn.net, task.name, view.gspn), list(view.assumptions)
+    lost = ["events, conditions, actions, times and priorities: a net file holds the ordinary view"]
+    return net_file_of(task), lost
+
+
+def net_file_of(task: Task) -> NetFile:
+    """The ordinary net of a task with its labels and positions."""
     flat = task.flat
     positions: dict[str, tuple[float, float]] = {}
     labels: dict[str, str] = {}
@@ -267,8 +273,7 @@ def _exported(task: Task, target: Path, stages: int) -> tuple[NetFile, list[str]
             positions[node.name] = (node.x, node.y)
         if node.label:
             labels[node.name] = node.label
-    lost = ["events, conditions, actions, times and priorities: a net file holds the ordinary view"]
-    return NetFile(task.net, task.name, None, labels, positions), lost
+    return NetFile(task.net, task.name, None, labels, positions)
 
 
 def graph_command(

@@ -7,6 +7,7 @@ flags, servers and priorities; our own tool-specific data. An arc of unknown kin
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -57,6 +58,9 @@ def own_data(element: Element) -> dict[str, str]:
     return {}
 
 
+ENTITY = re.compile(r"<!ENTITY", re.IGNORECASE)
+
+
 def parse_pnml(text: str | bytes, file: str = "PNML") -> NetFile:
     """The net in a PNML text. Raises FormatError."""
     root = _tree(text, file)
@@ -72,6 +76,10 @@ def parse_pnml(text: str | bytes, file: str = "PNML") -> NetFile:
 
 
 def _tree(text: str | bytes, file: str) -> Element:
+    if ENTITY.search(text if isinstance(text, str) else text.decode("latin-1")):
+        raise FormatError(
+            file, "XML", "a PNML file that defines entities", "they can grow without bound: write them out"
+        )
     parser = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
     try:
         parser.feed(text)

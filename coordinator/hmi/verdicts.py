@@ -6,8 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from coordinator.analysis import pnml_writing
+from coordinator.analysis.commands import net_file_of
+from coordinator.analysis.netfile import FormatError as NetFormatError
+from coordinator.analysis.pnml_reading import parse_pnml
 from coordinator.check import check
-from coordinator.hmi import pnml
+from coordinator.hmi.netfiles import as_task_file
 from coordinator.task import Task
 from coordinator.taskfile import TaskFileError, dumps, loads
 
@@ -55,7 +59,7 @@ def export(text: str, filename: str, form: str) -> Made:
     if form == "toml":
         return Made(dumps(task), "application/toml")
     if form == "pnml":
-        return Made(pnml.write(task), "application/xml")
+        return Made(pnml_writing.write_pnml(net_file_of(task)), "application/xml")
     raise FormatError(f"no format {form!r}: toml and pnml are known")
 
 
@@ -66,6 +70,6 @@ def imported(form: str, text: str) -> str:
     if form != "pnml":
         raise FormatError(f"no format {form!r}: toml and pnml are known")
     try:
-        return pnml.read(text)
-    except pnml.PnmlError as error:
+        return as_task_file(parse_pnml(text))
+    except NetFormatError as error:
         raise FormatError(f"not a place/transition net in PNML: {error}") from error

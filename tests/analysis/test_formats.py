@@ -354,3 +354,11 @@ def test_storm_reads_what_we_write_and_agrees(tmp_path: Path) -> None:
     (formula,) = stormpy.parse_properties('LRA=? [ "pkan1" ]')
     found = stormpy.model_checking(model, formula).get_value(0)
     assert long_run(Chain.of(gspn)).occupancy["pkan1"] == pytest.approx(found, abs=1e-5)
+
+
+def test_entities_are_refused() -> None:
+    """A document that could grow without bound is not even parsed, as text and as bytes."""
+    text = '<!DOCTYPE pnml [<!ENTITY a "aaaa">]><pnml><net id="n"><page id="g"><place id="&a;"/></page></net></pnml>'
+    for form in (text, text.encode()):
+        with pytest.raises(FormatError, match="defines entities"):
+            parse_pnml(form)

@@ -12,7 +12,8 @@ import aiohttp
 import pytest
 import pytest_asyncio
 
-from coordinator.hmi import pnml
+from coordinator.analysis.pnml_reading import parse_pnml
+from coordinator.hmi.netfiles import as_task_file
 from coordinator.hmi.server import Page
 from coordinator.taskfile import load, loads
 from tests.hmi.stage import Stage
@@ -176,7 +177,7 @@ def test_names_from_elsewhere_become_names_of_ours() -> None:
     )
     arcs = '<arc id="a" source="p0" target="t"><inscription><text>3</text></inscription></arc>'
     text = f'<pnml><net id="n"><page id="g">{nodes}<transition id="t"/>{arcs}</page></net></pnml>'
-    document = pnml.read(text)
+    document = as_task_file(parse_pnml(text))
     assert all(f"[places.{name}]" in document for name in ("a_b", "a_b_2", "n1", "p3"))
     assert 'in = ["a_b*3"]' in document
     assert loads(document.replace('final = "false"', 'final = "n1 == 0"')).places["a_b"].tokens == 0
