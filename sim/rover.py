@@ -99,10 +99,6 @@ class Rover:
         """rad/s that a wheel reaches on what the battery gives now."""
         return self.truth.top_speed * self.voltage / self.truth.nominal_voltage
 
-    def due(self) -> float:
-        """When it must be moved on at the latest (s)."""
-        return self._slot + SLOT
-
     def move_to(self, now: float) -> None:
         """Bring it up to `now`."""
         while self._slot + SLOT <= now + 1e-9:

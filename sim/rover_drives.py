@@ -27,6 +27,8 @@ _STATUSWORD, _POSITION, _VELOCITY, _TORQUE, _VOLTAGE, _MAX_SPEED, _TARGET = (
         Object.TARGET_VELOCITY,
     )
 )
+_LONGEST: Final = 0.1
+"""s between two set points beyond which the reference's slope is not made up for."""
 _AT_REST: Final = 0.05
 """rad/s below which a wheel counts as having come to rest after a fault."""
 _TURN: Final = 2.0 * math.pi
@@ -77,7 +79,7 @@ class WheelDrive(PowerDrive):
         if since > 0.0:
             self._speed = (self._counted - counted) * _TURN / self._rover.truth.encoder_counts / since
         if self.state is State.OPERATION_ENABLED:
-            self._aim(self.values[_TARGET] / UNITS, min(since, SLOT))
+            self._aim(self.values[_TARGET] / UNITS, min(since, _LONGEST))
 
     def _count(self) -> int:
         return math.floor(self._wheel.angle * self._rover.truth.encoder_counts / _TURN)

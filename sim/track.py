@@ -188,10 +188,6 @@ class Track:
                 return found
         return min((self._near(number, x, y) for number in range(len(self.elements))), key=lambda near: near.distance)
 
-    def near_element(self, number: int, x: float, y: float) -> Near:
-        """The point of one element's centre line nearest to (x, y)."""
-        return self._near(number, x, y)
-
     def _near(self, number: int, x: float, y: float) -> Near:
         element = self.elements[number]
         way, offset, distance = element.nearest(x, y)
