@@ -6,17 +6,22 @@ All carry the same record there and back: a name, three numbers and a text, by v
 from __future__ import annotations
 
 import asyncio
+import os
 import socket
 import time
 from collections.abc import Awaitable, Coroutine
+from pathlib import Path
 from typing import Any, ClassVar
 
 from services.comm.callee import Callee, Offer
 from services.comm.caller import Caller
 from services.comm.client import Client
+from services.comm.directory import parse
 from services.comm.messages import Call, Hello, Outcome
 from services.comm.server import Server
+from services.shell import NodeShell
 
+ROOT = Path(__file__).resolve().parents[2]
 RECORD = {"name": "catch_point", "value": [1.0, 0.25, 0.6], "text": "a record of about one hundred bytes, by value"}
 KEY = bytes(range(32))
 HOST = "127.0.0.1"
@@ -248,3 +253,26 @@ class PetrobotSealed(Petrobot):
 
     name = "petrobot, sealed"
     key = KEY
+
+
+class PetrobotWorker(Petrobot):
+    """An action in the warm worker process of its node: where every action of a robot runs."""
+
+    name = "petrobot, in its worker"
+    PLACES = """\
+schema = 1
+[nodes.node]
+host = "127.0.0.1"
+port = {port}
+[actions]
+echo = {{ run = "tests.bench.wire_action:echo", task = "echo", node = "node" }}
+"""
+
+    async def start(self) -> int:
+        os.environ["PYTHONPATH"] = str(ROOT)  # the worker imports its action
+        with socket.create_server((HOST, 0)) as probe:
+            port = int(probe.getsockname()[1])
+        text = self.PLACES.format(port=port)
+        self.shell = NodeShell(parse(text, ROOT / "services.toml"), "node", text)
+        await self.shell.start()
+        return port

@@ -24,6 +24,7 @@ from tests.bench.wire_contenders import (
     Contender,
     Petrobot,
     PetrobotSealed,
+    PetrobotWorker,
     payload,
 )
 
@@ -68,16 +69,22 @@ class Pyro(Contender):
         return taken
 
     def rate(self, count: int, in_flight: int) -> float:
+        connected = threading.Barrier(in_flight + 1)
+
         def several() -> None:
             proxy = self.api.Proxy(self.uri)
+            proxy.echo(RECORD)  # connects
+            connected.wait()
             for _ in range(count // in_flight):
                 proxy.echo(RECORD)
 
-        began = time.perf_counter()
         with ThreadPoolExecutor(in_flight) as pool:
-            for future in [pool.submit(several) for _ in range(in_flight)]:
+            futures = [pool.submit(several) for _ in range(in_flight)]
+            connected.wait()
+            began = time.perf_counter()
+            for future in futures:
                 future.result()
-        return count // in_flight * in_flight / (time.perf_counter() - began)
+            return count // in_flight * in_flight / (time.perf_counter() - began)
 
 
 class Rpyc(Contender):
@@ -212,4 +219,14 @@ class Grpc(AsyncContender):
         await self.channel.close()
 
 
-CONTENDERS: list[type[Contender]] = [Bare, BareBuffered, Petrobot, PetrobotSealed, Pyro, Rpyc, Zmq, Grpc]
+CONTENDERS: list[type[Contender]] = [
+    Bare,
+    BareBuffered,
+    Petrobot,
+    PetrobotSealed,
+    PetrobotWorker,
+    Pyro,
+    Rpyc,
+    Zmq,
+    Grpc,
+]

@@ -1,0 +1,12 @@
+"""The action that `wire.py` calls in a node's worker process."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from services.action import Context, Result, success
+
+
+def echo(ctx: Context, **values: Any) -> Result:
+    """Gives back what it is given."""
+    return success(**values)
