@@ -6,7 +6,7 @@ file and services.toml, versions, seed. Numbers count up by one. A file that end
 fails its checksum, was torn by a crash: the tail is dropped and reported. A record that fails its checksum with others
 behind it is damage, not a crash, and is refused.
 
-Why not SQLite: see docs/decisions/journal.md for the measurement.
+Kinds of a mission run's journal: coordinator/recording.py. Why not SQLite: docs/decisions/journal.md has the measurement.
 """
 
 from __future__ import annotations
@@ -58,6 +58,8 @@ class JournalWriter:
         """Create a journal with a header, or, without one, go on with an existing file behind its last good record."""
         self.path = path
         self._buffer = bytearray()
+        self._unsynced = False
+        """Whether records were handed to the operating system since the last sync."""
         self.syncs = 0
         if header is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -89,10 +91,13 @@ class JournalWriter:
     @property
     def pending(self) -> bool:
         """Whether records wait for the next sync."""
-        return bool(self._buffer)
+        return bool(self._buffer) or self._unsynced
 
     def flush(self) -> None:
         """Hand what was appended to the operating system: it survives the death of this process, not of the machine."""
+        if not self._buffer:
+            return
+        self._unsynced = True
         view = memoryview(self._buffer)
         try:
             while view:
@@ -104,11 +109,12 @@ class JournalWriter:
         self._buffer.clear()
 
     def sync(self) -> None:
-        """Make all that was appended durable."""
-        if self._buffer:
-            self.flush()
-        os.fdatasync(self._file)
-        self.syncs += 1
+        """Make all that was appended durable; costs nothing if it is already."""
+        self.flush()
+        if self._unsynced:
+            os.fdatasync(self._file)
+            self.syncs += 1
+            self._unsynced = False
 
     def close(self) -> None:
         """Sync and close."""

@@ -18,7 +18,7 @@ from coordinator.lockstep_party import NAME, CoordinatorParty
 from coordinator.mission import Mission
 from coordinator.partners import FirstAlternative, Forgetful, Observer, Selector, Store
 from coordinator.realtime import credentials_of
-from coordinator.recording import EPOCH, JournalStore, boots, last_epoch, replay
+from coordinator.recording import EPOCH, JournalStore, last_epoch, origin_of, replay, stages
 from coordinator.supervisor import Program, is_local
 from coordinator.task import Task
 from services.comm.caller import Caller
@@ -63,22 +63,20 @@ def with_runs(task: Task, runs: int | None) -> tuple[Task, int]:
 
 
 def make_mission(
-    directory: Directory, setting: Setting, mission: str, boot: str, store: Store | None = None
+    directory: Directory, setting: Setting, mission: str, boot: str, store: Store | None = None, name: str = NAME
 ) -> Mission:
-    """A mission run with a caller for each node of the directory."""
+    """A mission run with a caller for each node of the directory; `name` is how its coordinator is known to them."""
     task, runs = with_runs(setting.task, setting.runs)
-    callers = make_callers(directory, boot, 1)
+    callers = make_callers(directory, boot, 1, name)
     devices = {a.name: a.device for a in directory.actions.values() if a.device}
     engine = Engine(task, devices)
     executor = Executor(task, engine, directory, callers, mission, setting.seed, setting.selector, store or Forgetful())
-    if isinstance(setting.selector, Observer):
-        executor.observers.append(setting.selector)
     return Mission(executor, {**task.parameters, **setting.parameters}, runs)
 
 
-def make_callers(directory: Directory, boot: str, epoch: int) -> dict[str, Caller]:
-    """A caller for each node, all introduced as the coordinator in this epoch."""
-    hello = Hello(OLDEST_VERSION, NEWEST_VERSION, "coordinator", NAME, boot, epoch, directory.hash)
+def make_callers(directory: Directory, boot: str, epoch: int, name: str = NAME) -> dict[str, Caller]:
+    """A caller for each node, all introduced as the coordinator of this name in this epoch."""
+    hello = Hello(OLDEST_VERSION, NEWEST_VERSION, "coordinator", name, boot, epoch, directory.hash)
     return {node: Caller(node, hello) for node in directory.nodes}
 
 
@@ -134,22 +132,16 @@ def mission_id(task: Task) -> str:
 
 
 def realtime_mission(directory: Directory, setting: Setting, mission: str, store: Store | None = None) -> Mission:
-    """A mission run on the wall clock."""
-    return make_mission(directory, setting, mission, secrets.token_hex(8), store)
+    """A mission run on the wall clock. Its coordinator goes by the mission's own id: so its epochs count resumes of this run
+    alone, what nodes keep for it is never taken for another's, and a second coordinator is another holder of leases."""
+    return make_mission(directory, setting, mission, secrets.token_hex(8), store, name=mission)
 
 
 def resumed_mission(
-    directory: Directory,
-    task: Task,
-    engine: Engine,
-    journal: Journal,
-    observers: Sequence[Observer],
-    now: float,
-    selector: Selector | None = None,
+    directory: Directory, task: Task, engine: Engine, journal: Journal, observers: Sequence[Observer], now: float
 ) -> tuple[Mission, Callable[[float], None]]:
     """A mission run as its journal left it, and what makes it go on once the nodes are there.
 
-    A selector that learns has to be among the observers too: the recorded steps bring it to where it was.
     Raises ReplayError when the engine does not derive what the journal says.
     """
     header = journal.header
@@ -158,15 +150,17 @@ def resumed_mission(
     writer.append(EPOCH, {"epoch": epoch})
     writer.sync()
     steps = list(replay(journal, engine))
-    origin = now - (steps[-1].time if steps else 0.0)
-    callers = make_callers(directory, secrets.token_hex(8), epoch)
-    store, chosen = JournalStore(writer, origin), selector or FirstAlternative()
-    executor = Executor(task, engine, directory, callers, header["mission"], header["seed"], chosen, store)
+    origin = origin_of(header, now, steps[-1].time if steps else 0.0)
+    name = NAME if header["mode"] == "lockstep" else header["mission"]
+    callers = make_callers(directory, secrets.token_hex(8), epoch, name)
+    executor = Executor(
+        task, engine, directory, callers, header["mission"], header["seed"], store=JournalStore(writer, origin)
+    )
     mission = Mission(executor, header["parameters"], header["runs"])
     executor.observers.extend(observers)
     for step in steps:
-        executor.relive(origin + step.time, step.stimulus, step.instructions, step.state)
-    return mission, lambda now: mission.resume(now, executor.state, boots(journal), origin)
+        mission.relive(origin + step.time, step)
+    return mission, lambda now: mission.resume(now, stages(journal))
 
 
 def local_programs(directory: Directory, *, lockstep: bool = False, mock: Path | None = None) -> list[Program]:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 from coordinator.mission import Mission, Stage
 from services.comm.directory import Directory
-from services.comm.messages import Call, Message
+from services.comm.messages import Call, Message, Refuse, Welcome
 from services.comm.party import Envelope
 
 NAME = "coordinator"
@@ -42,6 +42,8 @@ class CoordinatorParty:
         self._now = now
         node = self._directory.party(envelope.source)
         caller = self.mission.callers[node]
+        if not caller.up and not isinstance(envelope.body, Welcome | Refuse):
+            return  # meant for a predecessor of this process: its connection is gone, and what was on its way with it
         caller.receive(now, envelope.body)
         if notices := caller.notices():
             self.mission.take(now, node, notices)

@@ -7,11 +7,12 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
-from coordinator.engine import State
+from coordinator.engine import Mode, State
 from coordinator.engine.instructions import Fired, Instruction, Report, RunRecorded, Severity, StartRun
 from coordinator.engine.stimuli import Begin, Stimulus
 from coordinator.executor import Executor
 from coordinator.net import Marking
+from coordinator.recording import PREPARED, SCORED, Step
 from coordinator.task import Status
 from services.comm.caller import Caller
 from services.comm.messages import Call, Outcome
@@ -116,6 +117,7 @@ class Mission:
         self.begun = self.ended = 0.0
         self.lost: dict[str, str] = {}
         """Nodes that are away, with the reason."""
+        self._early: list[tuple[str, Notice]] = []
         task = executor.task.flat
         index = task.net.place_index.get(task.runs_place) if task.runs_place else None
         self.tally = Tally(index)
@@ -133,19 +135,43 @@ class Mission:
         else:
             self.stage = Stage.PREPARING
 
-    def resume(self, now: float, state: State, boots: Mapping[str, str], begun: float) -> None:
-        """Go on with a mission run that another process began at `begun` (on this process's clock)."""
-        self.stage, self.begun = Stage.RUNNING, begun
-        self.executor.subscribe(now)
-        self.executor.adopt(now, state, boots)
+    def relive(self, now: float, step: Step) -> None:
+        """Take in a step that another process recorded at `now` (on this process's clock)."""
+        if isinstance(step.stimulus, Begin):
+            self.begun = now
+        self.executor.relive(now, step)
+        if self.executor.finished is not None and not self.ended:
+            self.ended = now
+
+    def resume(self, now: float, stages: Mapping[str, Mapping[str, Any]]) -> None:
+        """Go on behind the last step relived; `stages` are those that the journal says to be over."""
+        if SCORED in stages:
+            self.score, self.stage = stages[SCORED], Stage.OVER
+        elif self.executor.finished is not None:
+            self._finish(now, self.ended)
+        elif self.executor.state.mode is not Mode.FRESH:
+            self.stage = Stage.RUNNING
+            self.executor.subscribe(now)
+            self.executor.adopt(now)
+            self.advance(now)
+        elif PREPARED in stages:
+            self._begin(now)
+        else:
+            self.start(now)
+        early, self._early = self._early, []
+        for node, notice in early:
+            self.take(now, node, [notice])
 
     def take(self, now: float, node: str, notices: Sequence[Notice]) -> None:
-        """Take what a node's caller noticed."""
+        """Take what a node's caller noticed. What comes before every node is there waits: nothing is led by halves."""
         self._note_links(node, notices)
+        if self.stage is Stage.CONNECTING:
+            self._early.extend((node, notice) for notice in notices if not isinstance(notice, PeerBack | PeerLost))
+            notices = [notice for notice in notices if isinstance(notice, PeerBack | PeerLost)]
         own = [n for n in notices if isinstance(n, Ended) and self._is_own(n.outcome)]
         for notice in own:
-            self.callers[node].acknowledge(now, notice.outcome.id)
             self._answered(now, notice.outcome)
+            self.callers[node].acknowledge(now, notice.outcome.id)
         self.executor.take(now, node, [n for n in notices if n not in own])
         self.advance(now)
 
@@ -154,7 +180,7 @@ class Mission:
         if self.stage is Stage.RUNNING:
             self.executor.advance(now)
             if self.executor.finished is not None:
-                self._finish(now)
+                self._finish(now, now)
 
     def due(self) -> float | None:
         """When `advance` has something to do next."""
@@ -189,10 +215,10 @@ class Mission:
         self.executor.subscribe(now)
         self.executor.stimulate(now, Begin(self.parameters))
 
-    def _finish(self, now: float) -> None:
-        self.ended = now
+    def _finish(self, now: float, ended: float) -> None:
+        self.ended = ended
         if self.tally.cycles:
-            self.tally.cycles[-1].ended = now
+            self.tally.cycles[-1].ended = ended
         cycles = [cycle.plain(now) for cycle in self.tally.cycles]
         asked = self._ask(now, "score", self.executor.task.score, {"cycles": cycles})
         self.stage = Stage.SCORING if asked else Stage.OVER
@@ -213,9 +239,14 @@ class Mission:
         if outcome.status != Status.SUCCESS:
             what = outcome.id.rpartition("/")[2]
             raise MissionError(f"{what}: {outcome.text or outcome.cause}", bad_input=outcome.cause == "bad_arguments")
+        store = self.executor.store
         if self.stage is Stage.PREPARING:
+            store.stage(PREPARED, {})
+            store.sync()
             self._begin(now)
         elif self.stage is Stage.SCORING:
+            store.stage(SCORED, outcome.values)
+            store.sync()
             self.score, self.stage = outcome.values, Stage.OVER
 
     def _note_links(self, node: str, notices: Sequence[Notice]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 from coordinator.engine import Instruction, State, Stimulus
 from services.comm.notice import Progress
@@ -27,6 +27,12 @@ class Store(Protocol):
     def node(self, name: str, boot: str) -> None:
         """Keep which boot of a node this run speaks to."""
 
+    def stage(self, name: str, values: Mapping[str, Any]) -> None:
+        """Keep that the mission run has come to a stage of its own (prepared, scored)."""
+
+    def flush(self) -> None:
+        """What was appended survives the end of this process."""
+
     def sync(self) -> None:
         """Make all that was appended safe."""
 
@@ -34,8 +40,11 @@ class Store(Protocol):
     def safe(self) -> bool:
         """Whether nothing waits for a sync."""
 
+    @property
+    def durable(self) -> bool:
+        """Whether every effect waits for a sync, also one that moves no hardware."""
 
-@runtime_checkable
+
 class Observer(Protocol):
     """Whoever follows the mission run: report, page, terminal."""
 
@@ -56,12 +65,19 @@ class Forgetful:
     """The store of a run without a journal."""
 
     safe = True
+    durable = False
 
     def append(self, now: float, stimulus: Stimulus, instructions: Sequence[Instruction], state: State) -> None:
         """Keep nothing."""
 
     def node(self, name: str, boot: str) -> None:
         """Keep nothing."""
+
+    def stage(self, name: str, values: Mapping[str, Any]) -> None:
+        """Keep nothing."""
+
+    def flush(self) -> None:
+        """Nothing to flush."""
 
     def sync(self) -> None:
         """Nothing to make safe."""

@@ -1,7 +1,13 @@
-"""Mission runs in the journal: what is written of each stimulus, and how a run is derived from it again."""
+"""Mission runs in the journal: what is written of each stimulus, and how a run is derived from it again.
+
+Kinds of records behind the header: `stimulus` (seconds since the origin, the stimulus, the marking after it, a digest of the
+instructions), `node` (which boot of a node is spoken to from here on), `stage` (the mission run was prepared, or scored, with what
+that gave), `epoch` (a coordinator took the run over).
+"""
 
 from __future__ import annotations
 
+import time
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,6 +22,8 @@ from coordinator.journal import Journal, JournalError, JournalWriter
 STIMULUS = "stimulus"
 NODE = "node"
 EPOCH = "epoch"
+STAGE = "stage"
+PREPARED, SCORED = "prepared", "scored"
 
 
 def digest(instructions: Sequence[Instruction]) -> int:
@@ -27,8 +35,11 @@ def digest(instructions: Sequence[Instruction]) -> int:
 class JournalStore:
     """The executor's store over a journal: each stimulus with the marking and a digest of the instructions that followed."""
 
-    def __init__(self, writer: JournalWriter, origin: float) -> None:
+    def __init__(self, writer: JournalWriter, origin: float, *, durable: bool = False) -> None:
+        """`origin` is when the journal's clock began, on the clock of whoever appends; with `durable` no effect at all leaves
+        before its cause is synced."""
         self.writer = writer
+        self.durable = durable
         self._origin = origin
 
     def append(self, now: float, stimulus: Stimulus, instructions: Sequence[Instruction], state: State) -> None:
@@ -44,6 +55,14 @@ class JournalStore:
     def node(self, name: str, boot: str) -> None:
         """Keep which boot of a node was spoken to: after a resume another boot is never asked to run a call again."""
         self.writer.append(NODE, {"node": name, "boot": boot})
+
+    def stage(self, name: str, values: Mapping[str, Any]) -> None:
+        """Keep that the mission run has come to a stage of its own: what follows it does not happen again after a resume."""
+        self.writer.append(STAGE, {"stage": name, "values": dict(values)})
+
+    def flush(self) -> None:
+        """What was appended survives the end of this process."""
+        self.writer.flush()
 
     def sync(self) -> None:
         """Make all that was appended durable."""
@@ -68,12 +87,16 @@ class Step:
     stimulus: Stimulus
     instructions: tuple[Instruction, ...]
     state: State
+    boots: Mapping[str, str]
+    """The boot of each node that was spoken to then."""
 
 
 def replay(journal: Journal, engine: Engine) -> Iterator[Step]:
     """Derive every state and instruction of a journal again. Raises ReplayError at the first difference."""
-    state = engine.initial()
+    state, boots = engine.initial(), dict[str, str]()
     for record in journal.records:
+        if record.kind == NODE:
+            boots = {**boots, record.data["node"]: record.data["boot"]}
         if record.kind != STIMULUS:
             continue
         try:
@@ -82,7 +105,7 @@ def replay(journal: Journal, engine: Engine) -> Iterator[Step]:
             raise JournalError(f"{journal.path}: record {record.number} holds no stimulus: {fault}") from fault
         state, instructions = engine.handle(state, stimulus)
         _compare(journal.path, record.number, record.data, engine, state, instructions)
-        yield Step(record.number, record.data["t"], stimulus, instructions, state)
+        yield Step(record.number, record.data["t"], stimulus, instructions, state, boots)
 
 
 def _compare(
@@ -98,11 +121,39 @@ def _compare(
         raise ReplayError(f"{where}: the instructions differ from those of then; now they are: {now}")
 
 
-def boots(journal: Journal) -> dict[str, str]:
-    """The boot of each node that the run spoke to last."""
-    return {r.data["node"]: r.data["boot"] for r in journal.records if r.kind == NODE}
+def stages(journal: Journal) -> dict[str, Mapping[str, Any]]:
+    """The stages that the mission run has come to, with their values."""
+    return {r.data["stage"]: r.data["values"] for r in journal.records if r.kind == STAGE}
 
 
 def last_epoch(journal: Journal) -> int:
     """The newest epoch in which the run was coordinated."""
     return max([1, *(int(r.data["epoch"]) for r in journal.records if r.kind == EPOCH)])
+
+
+def clock_reading(now: float) -> dict[str, Any]:
+    """What a header keeps of the moment at which its journal's clock begins, so that another process can count on from it.
+
+    `monotonic` (s) holds for all processes of one boot of the host, `unix` (s) for longer, as well as the host's clock is set.
+    """
+    return {"monotonic": now, "host_boot": _host_boot(), "unix": time.time()}
+
+
+def origin_of(header: Mapping[str, Any], now: float, last: float) -> float:
+    """When a journal's clock began (s), on this process's clock, which reads `now`; its last record is of the time `last`.
+
+    In lock step the clock of simulated time is every process's own. In real time what passed while nobody coordinated counts.
+    """
+    if header["mode"] == "lockstep":
+        return 0.0
+    clock = header.get("clock")
+    if not clock:
+        return now - last
+    if clock["host_boot"] == _host_boot() and clock["monotonic"] <= now:
+        return float(clock["monotonic"])
+    return now - max(0.0, time.time() - float(clock["unix"]))
+
+
+def _host_boot() -> str:
+    path = Path("/proc/sys/kernel/random/boot_id")
+    return path.read_text(encoding="ascii").strip() if path.exists() else ""

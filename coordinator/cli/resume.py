@@ -58,6 +58,7 @@ async def _resume(found: Recorded, options: argparse.Namespace) -> tuple[Mission
     from coordinator.cli.run import drive
     from coordinator.engine import Mode
     from coordinator.launch import resumed_mission
+    from coordinator.runfolder import RESULT
     from coordinator.timeline import Timeline
 
     timeline = Timeline()
@@ -65,8 +66,8 @@ async def _resume(found: Recorded, options: argparse.Namespace) -> tuple[Mission
     selector, session = resumed_selector(found.task, found.journal.header)
     observers: list[Observer] = [timeline] if session is None else [timeline, session.selector]
     mission, go_on = resumed_mission(found.directory, found.task, found.engine, found.journal, observers, now, selector)
-    if mission.executor.state.mode in (Mode.FRESH, Mode.FINISHED):
-        raise CommandError(2, f"{options.run}: the run {'had ended' if mission.executor.finished else 'had not begun'}")
+    if mission.executor.state.mode is Mode.FINISHED and (found.journal.path.parent / RESULT).exists():
+        raise CommandError(2, f"{options.run}: the run had ended; its result is {found.journal.path.parent / RESULT}")
     options.folder = found.journal.path.parent
     with saved(session, found.journal.header["mission"]) as learned:
         await drive(found.directory, mission, options, go_on)

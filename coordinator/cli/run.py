@@ -252,7 +252,7 @@ def _store(
 ) -> JournalStore:
     from coordinator.cli.loading import task_path
     from coordinator.journal import JournalWriter
-    from coordinator.recording import JournalStore
+    from coordinator.recording import JournalStore, clock_reading
     from coordinator.runfolder import JOURNAL, header
 
     services = directory.source.read_text(encoding="utf-8")
@@ -261,6 +261,7 @@ def _store(
         "seed": setting.seed,
         "runs": with_runs_of(setting),
         "parameters": {**setting.task.parameters, **setting.parameters},
+        "clock": clock_reading(origin),
         "chosen": dict(_pairs("--use", options.use)),
         **({} if options.learning is None else {"learning": options.learning.beginning()}),
     }

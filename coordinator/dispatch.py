@@ -1,0 +1,367 @@
+"""Runs in the hands of nodes: the engine's orders become calls, and what nodes say of them becomes stimuli.
+
+A machine without clock or sockets; its calls are in its callers. It keeps every device fenced whose last run is not known to be
+over, and after a resume it asks the nodes for the runs that an earlier process gave them (docs/semantics.md, section 12).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from coordinator.engine import Instruction, State, Stimulus
+from coordinator.engine.instructions import (
+    ArmTimer,
+    CancelRun,
+    DisarmTimer,
+    HoldRun,
+    HoldTimer,
+    ReleaseRun,
+    ReleaseTimer,
+    StartRun,
+)
+from coordinator.engine.stimuli import Hold, Pause, RunEnded, RunHeld, RunStarted, StopConfirmed, StopFailed, TimerFired
+from coordinator.fences import FOR_GOOD, UNSURE, Fences
+from coordinator.task import Executed, Status
+from coordinator.timekeeping import Timers
+from services.comm.caller import Caller
+from services.comm.directory import Directory
+from services.comm.messages import Answer, Call, Command, Outcome
+
+ESCALATION: Final = 3.0
+"""Seconds after a run's own time to stop that its node needs at most for the stop routine and the kill of its worker."""
+RESUMED: Final = "resumed"
+_GIVEN_UP: Final = UNSURE | {RESUMED, "rebooted", "refused", "unreachable"}
+"""Causes by which this side ended a run without word of its node."""
+_TIMERS: Final = (ArmTimer, DisarmTimer, HoldTimer, ReleaseTimer)
+
+
+@dataclass
+class Flight:
+    """A run that was handed to a node (or waits for its device's fence); `begun` is when the engine ordered it (s)."""
+
+    start: StartRun
+    node: str
+    device: str
+    begun: float
+    waits: bool = False
+    """For the fence of its device."""
+    cancelled: bool = False
+    abandon: bool = False
+    """If its node says that it still goes on, it is ended here: its action's `on_resume` is `error`."""
+
+
+class Dispatch:
+    """Hands runs to nodes. `callers` has one caller for each node of the directory; call ids are `mission/run`."""
+
+    def __init__(self, directory: Directory, callers: Mapping[str, Caller], mission: str, seed: int) -> None:
+        self.directory = directory
+        self.callers = callers
+        self.flights: dict[str, Flight] = {}
+        self._mission = mission
+        self._seed = seed
+        self._fences = Fences()
+        self._parting: dict[str, Flight] = {}
+        """Runs that this side is done with, or is stopping, and that their node has not said to be over."""
+        self._timers = Timers()
+        self._commands: dict[str, str] = {}
+        self._command_count = 0
+        self._kept: dict[str, Sequence[str]] = {}
+        """By node: ids that it still knew when it welcomed us and nobody has settled yet."""
+        self._earlier: dict[str, tuple[StartRun, str]] = {}
+        """Runs that an earlier process started, with the boot of their node as it was then."""
+        self._settled: dict[str, bool] = {}
+        """Runs that ended in an earlier process, and whether their node said so."""
+        self._orders: Mapping[type, Callable[[float, Any], list[Stimulus]]] = {
+            StartRun: self._start,
+            CancelRun: self._cancel,
+            HoldRun: lambda now, order: self._command(now, order.run, "hold"),
+            ReleaseRun: self._release,
+            **dict.fromkeys(_TIMERS, self._timer),
+        }
+
+    def carries_out(self, instruction: Instruction) -> bool:
+        """Whether it is an order for this room."""
+        return type(instruction) in self._orders
+
+    def carry_out(self, now: float, order: Instruction) -> list[Stimulus]:
+        """Carry out an order; gives what is known of it at once."""
+        return self._orders[type(order)](now, order)
+
+    def moves_hardware(self, order: Instruction) -> bool:
+        """Whether the order reaches a device."""
+        if isinstance(order, StartRun):
+            entry = self.directory.actions.get(order.action)
+            return entry is not None and bool(entry.device)
+        if isinstance(order, CancelRun | HoldRun | ReleaseRun):
+            flight = self.flights.get(order.run)
+            return flight is not None and bool(flight.device)
+        return False
+
+    def call_id(self, run: str) -> str:
+        """The id of a run's call, unique for ever."""
+        return f"{self._mission}/{run}"
+
+    def run_of(self, call: str) -> str | None:
+        """The run that a call of this mission run was made for, None if it was made for none that is under way."""
+        run = call.removeprefix(self._mission + "/")
+        return run if run in self.flights else None
+
+    # --- orders ------------------------------------------------------------------------------------------------------
+
+    def _start(self, now: float, start: StartRun, boot: str = "", known: bool = False) -> list[Stimulus]:
+        entry = self.directory.actions.get(start.action)
+        if entry is None:
+            text = f"{self.directory.source}: no node offers {start.action}"
+            return [RunEnded(start.run, Status.ERROR, "not_offered", text, Executed.NO)]
+        flight = self.flights[start.run] = Flight(start, entry.node, entry.device, now)
+        if entry.device in self._fences and not entry.at_once and not known:
+            flight.waits = True
+        else:
+            self._call(now, flight, boot)
+        return []
+
+    def _call(self, now: float, flight: Flight, boot: str = "") -> None:
+        flight.waits = False
+        start = flight.start
+        arguments = {**self.directory.actions[start.action].args, **start.arguments}
+        call = Call(self.call_id(start.run), start.action, arguments, start.deadline, boot=boot, seed=self._seed)
+        self.callers[flight.node].call(now, call)
+
+    def _cancel(self, now: float, cancel: CancelRun) -> list[Stimulus]:
+        flight = self.flights.get(cancel.run)
+        if flight is None or flight.waits:
+            self.flights.pop(cancel.run, None)
+            return [StopConfirmed(cancel.run, Executed.NO)]
+        flight.cancelled = True
+        within = cancel.within + ESCALATION
+        self.callers[flight.node].cancel(now, self.call_id(cancel.run), cancel.reason, within)
+        return []
+
+    def _release(self, now: float, release: ReleaseRun) -> list[Stimulus]:
+        flight = self.flights.get(release.run)
+        if flight is not None:
+            self.callers[flight.node].release(now, self.call_id(release.run))
+        return self._command(now, release.run, "release")
+
+    def _command(self, now: float, run: str, verb: str) -> list[Stimulus]:
+        flight = self.flights.get(run)
+        if flight is None:
+            return []
+        self._command_count += 1
+        key = f"{self._mission}/{verb}#{self._command_count}"
+        if verb == "hold":
+            self._commands[key] = run
+        self.callers[flight.node].command(now, Command(key, verb, flight.device, {"run": self.call_id(run)}))
+        return []
+
+    def _timer(self, now: float, order: ArmTimer | DisarmTimer | HoldTimer | ReleaseTimer) -> list[Stimulus]:
+        if isinstance(order, ArmTimer):
+            self._timers.arm(now, order.key, order.seconds)
+        elif isinstance(order, DisarmTimer):
+            self._timers.disarm(order.key)
+        elif isinstance(order, HoldTimer):
+            self._timers.hold(now, order.key)
+        else:
+            self._timers.release(now, order.key)
+        return []
+
+    # --- what nodes say ----------------------------------------------------------------------------------------------
+
+    def accepted(self, now: float, call: str) -> list[Stimulus]:
+        """The node took a call, or says that it goes on."""
+        run = self.run_of(call)
+        if run is None:
+            return []
+        return self._abandon(now, run) if self.flights[run].abandon else [RunStarted(run)]
+
+    def ended(self, now: float, outcome: Outcome) -> list[Stimulus]:
+        """A call has ended, by word of its node or by this side's decision."""
+        run = self.run_of(outcome.id)
+        if run is None:
+            return self.late(now, outcome) if self._parted(outcome) else []
+        flight = self.flights.pop(run)
+        if outcome.cause not in UNSURE or Executed(outcome.executed) is Executed.NO:
+            return [_run_ended(run, outcome)]
+        if flight.device:
+            orphan_time = self.directory.actions[flight.start.action].orphan_time
+            until = self._fences.after(outcome.cause, now, orphan_time)
+            self._fences.put(flight.device, run, flight.node, until)
+            self._parting[run] = flight
+        if not flight.cancelled:
+            return [_run_ended(run, outcome)]
+        if outcome.cause == "no_answer":
+            return [StopFailed(run, f"{outcome.text}, neither by its stop routine nor by the end of its worker")]
+        return [] if flight.device else [_run_ended(run, outcome)]
+
+    def _parted(self, outcome: Outcome) -> bool:
+        """Whether a node says (not this side decides) that a run is over which was given up here."""
+        return outcome.id.removeprefix(self._mission + "/") in self._parting and outcome.cause not in _GIVEN_UP
+
+    def late(self, now: float, outcome: Outcome) -> list[Stimulus]:
+        """A node's own word on a run that had ended here: it is recorded, moves nothing, and frees the device."""
+        run = outcome.id.removeprefix(self._mission + "/")
+        if run == outcome.id or "#" not in run:
+            return []
+        self._parting.pop(run, None)
+        for device in self._fences.lift(run):
+            self._go_on(now, device)
+        return [_run_ended(run, outcome)]
+
+    def answered(self, now: float, answer: Answer) -> list[Stimulus]:
+        """The answer to a hold."""
+        run = self._commands.pop(answer.id, None)
+        flight = self.flights.get(run) if run is not None else None
+        if run is None or flight is None:
+            return []
+        said = str(answer.data.get("answers", {}).get(flight.device or flight.node, "")).replace(" ", "_")
+        known = {Hold.HELD.value: Hold.HELD, Hold.STOPPED.value: Hold.STOPPED}
+        held = known.get(said, Hold.CANNOT) if answer.ok else Hold.CANNOT
+        if held is Hold.HELD:
+            self.callers[flight.node].hold(now, self.call_id(run))
+        return [RunHeld(run, held)]
+
+    def back(self, now: float, node: str, same_boot: bool, runs: Sequence[str]) -> None:
+        """A node has welcomed us; `runs` are the ids that it still knows."""
+        if not same_boot:
+            self._fences.rebooted(now, node)
+        self._kept[node] = runs
+
+    # --- time --------------------------------------------------------------------------------------------------------
+
+    def advance(self, now: float) -> list[Stimulus]:
+        """What is over: timers, fences, and the patience of runs that wait for one."""
+        stimuli: list[Stimulus] = [TimerFired(key) for key in self._timers.over(now)]
+        for device, fence in self._fences.over(now):
+            flight = self._parting.pop(fence.run, None)
+            if flight is not None and flight.cancelled:
+                stimuli.append(StopConfirmed(fence.run, Executed.UNKNOWN))
+            self._go_on(now, device)
+        for run, flight in [(r, f) for r, f in self.flights.items() if f.waits and now >= f.begun + f.start.deadline]:
+            del self.flights[run]
+            text = f"{flight.device} is not known to stand still after {self._fences[flight.device].run}"
+            stimuli.append(RunEnded(run, Status.ERROR, "device_fenced", text, Executed.NO))
+        return stimuli
+
+    def _go_on(self, now: float, device: str) -> None:
+        """The device is free: start what waited for it."""
+        for flight in [f for f in self.flights.values() if f.waits and f.device == device]:
+            self._call(now, flight)
+
+    def due(self) -> float | None:
+        """When `advance` has something to do next."""
+        times = [self._timers.due(), self._fences.due()]
+        times += [flight.begun + flight.start.deadline for flight in self.flights.values() if flight.waits]
+        return min((t for t in times if t is not None), default=None)
+
+    # --- after a resume ----------------------------------------------------------------------------------------------
+
+    def relive(
+        self, now: float, stimulus: Stimulus, instructions: Iterable[Instruction], boots: Mapping[str, str]
+    ) -> None:
+        """A step that an earlier process took at `now`: its timers and fences still count."""
+        if isinstance(stimulus, TimerFired):
+            self._timers.disarm(stimulus.key)
+        elif isinstance(stimulus, RunEnded | StopConfirmed):
+            self._relive_end(now, stimulus)
+        elif isinstance(stimulus, StopFailed):
+            self._relive_fence(now, stimulus.run, "no_answer")
+        for instruction in instructions:
+            if isinstance(instruction, _TIMERS):
+                self.carry_out(now, instruction)
+            elif isinstance(instruction, StartRun):
+                entry = self.directory.actions.get(instruction.action)
+                self._earlier[instruction.run] = instruction, boots.get(entry.node, "") if entry else ""
+
+    def _relive_end(self, now: float, end: RunEnded | StopConfirmed) -> None:
+        cause = end.cause if isinstance(end, RunEnded) else ""
+        unsure = isinstance(end, RunEnded) and cause in UNSURE and end.executed is not Executed.NO
+        self._settled[end.run] = cause not in _GIVEN_UP
+        self._parting.pop(end.run, None)
+        self._fences.lift(end.run)
+        if unsure:
+            self._relive_fence(now, end.run, cause)
+
+    def _relive_fence(self, now: float, run: str, cause: str) -> None:
+        start, _ = self._earlier.get(run, (None, ""))
+        entry = self.directory.actions.get(start.action) if start is not None else None
+        if start is not None and entry is not None and entry.device:
+            self._parting[run] = Flight(start, entry.node, entry.device, now, cancelled=cause == "no_answer")
+            self._fences.put(entry.device, run, entry.node, self._fences.after(cause, now, entry.orphan_time))
+
+    def adopt(self, now: float, orders: Iterable[Instruction], state: State) -> list[Stimulus]:
+        """Carry out again the orders that an earlier process left open, and settle what the nodes still keep of its runs."""
+        stimuli = self.advance(now)
+        for order in orders:
+            if isinstance(order, StartRun):
+                stimuli += self._rejoin(now, order)
+            elif isinstance(order, CancelRun):
+                stimuli += self._cancel_again(now, order, state)
+            elif self.carries_out(order) and not (
+                isinstance(order, ArmTimer | HoldTimer) and order.key in self._timers
+            ):
+                stimuli += self.carry_out(now, order)
+        for node in list(self._kept):
+            self.settle(now, node)
+        return stimuli
+
+    def settle(self, now: float, node: str) -> None:
+        """Of the runs that a node keeps for this mission run: stop those that are of no use, let it forget the others."""
+        caller = self.callers[node]
+        for id_ in self._kept.pop(node, ()):
+            run = id_.removeprefix(self._mission + "/")
+            if run == id_ or "#" not in run or run in self.flights:
+                continue
+            if self._settled.get(run, False):
+                caller.acknowledge(now, id_)
+            elif run in self._settled or run in self._parting or run not in self._earlier:
+                caller.disown(now, id_)
+
+    def _rejoin(self, now: float, start: StartRun) -> list[Stimulus]:
+        """Ask for a run under its old id: the node goes on with it or gives its stored result; another boot answers unknown."""
+        entry = self.directory.actions.get(start.action)
+        if entry is None:
+            return self._start(now, start)
+        known = self.call_id(start.run) in self._kept.get(entry.node, ())
+        boot = self.callers[entry.node].boot if known else self._earlier.get(start.run, (start, ""))[1]
+        stimuli = self._start(now, start, boot, known)
+        self.flights[start.run].abandon = entry.on_resume == "error"
+        if entry.on_resume == "ask":
+            text = f"{start.action} was going on when the coordinator ended: go on with it?"
+            stimuli.append(Pause(text))
+        return stimuli
+
+    def _abandon(self, now: float, run: str) -> list[Stimulus]:
+        flight = self.flights.pop(run)
+        self.callers[flight.node].cancel(now, self.call_id(run), RESUMED)
+        if flight.device:
+            self._parting[run] = flight
+            self._fences.put(flight.device, run, flight.node, FOR_GOOD)
+        text = f"the coordinator ended while it went on, and {flight.start.action} is not to be rejoined"
+        return [RunEnded(run, Status.ERROR, RESUMED, text, Executed.YES)]
+
+    def _cancel_again(self, now: float, cancel: CancelRun, state: State) -> list[Stimulus]:
+        run = state.run(cancel.run)
+        if run is not None and run.action in self.directory.actions:
+            primitive = self._earlier[run.id][0].primitive_task if run.id in self._earlier else ""
+            self._rejoin_to_stop(now, StartRun(run.id, run.place, primitive, run.action, run.arguments, cancel.within))
+        return self._cancel(now, cancel)
+
+    def _rejoin_to_stop(self, now: float, start: StartRun) -> None:
+        """A run that is stopping: asked for under its old id only to hear of its end."""
+        self._rejoin(now, start)
+        self.flights[start.run].abandon = False
+
+
+def _run_ended(run: str, outcome: Outcome) -> RunEnded:
+    return RunEnded(
+        run,
+        Status(outcome.status),
+        outcome.cause,
+        outcome.text,
+        Executed(outcome.executed),
+        dict(outcome.values),
+        outcome.seconds,
+        cpu_seconds=outcome.cpu_seconds or None,
+    )
