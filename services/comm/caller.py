@@ -65,7 +65,7 @@ class Caller:
         self._messages: list[m.Message] = []
         self._notices: list[Notice] = []
         self._takers: Mapping[type, Callable[[float, Any], None]] = {
-            m.Outcome: self._take_outcome,
+            m.Outcome: self.take_outcome,
             m.Accept: self._take_accept,
             m.Feedback: self._take_feedback,
             m.Event: self._take_event,
@@ -249,7 +249,8 @@ class Caller:
         if taker is not None:
             taker(now, message)
 
-    def _take_outcome(self, now: float, outcome: m.Outcome) -> None:
+    def take_outcome(self, now: float, outcome: m.Outcome) -> None:
+        """`receive` of a result."""
         id_ = outcome.id
         pending = self._pending.pop(id_, None)
         if pending is not None:

@@ -22,6 +22,7 @@ from services.comm.under_way import NEVER
 from services.comm.wire import ProtocolError, Side, State
 
 OnNotices = Callable[[float, list[Notice]], None]
+NOT_TRUSTED = "perhaps our certificate is not trusted there: it takes TLS 1.3 and certificates of its own cell alone"
 _NO_ARGUMENTS: Mapping[str, Any] = {}
 AT_ONCE = 16
 """Calls that share one write: the peer takes them in while the next ones are made."""
@@ -42,10 +43,10 @@ class _ClientLink(Link):
 
     def took(self, now: float, messages: list[Message]) -> None:
         client = self._client
-        receive = client.caller.receive
+        receive, take_outcome = client.caller.receive, client.caller.take_outcome
         for message in messages:
             if type(message) is Outcome:
-                receive(now, message)
+                take_outcome(now, message)
             elif isinstance(message, Welcome):
                 self.welcome = True
                 self.opened()
@@ -250,7 +251,7 @@ class Client:
                     lambda: _ClientLink(self), self.host, self.port, ssl=self.tls, server_hostname=name
                 )
         except (OSError, TimeoutError) as fault:
-            self.trouble = _said(fault)
+            self.trouble = self._said(fault)
             return None
         self.trouble = ""
         self._link = link
@@ -264,6 +265,8 @@ class Client:
 
     def gone(self, now: float, link: _ClientLink) -> None:
         """A link is over."""
+        if self.tls is not None and not link.welcome and link.refusal is None:
+            link.reason += f"; {NOT_TRUSTED}"  # in TLS 1.3 a client is let in before its certificate is looked at
         self.trouble = link.reason
         if self._link is link:
             self._link = None
@@ -274,9 +277,9 @@ class Client:
             self.caller.link_down(now, link.reason, final=link.silent)
         self.flush(now)
 
-
-def _said(fault: Exception) -> str:
-    """Why there is no connection, in words."""
-    if isinstance(fault, ssl.SSLCertVerificationError):
-        return f"its certificate is not that of the node: {fault.verify_message}"
-    return str(getattr(fault, "strerror", "") or fault) or "no answer"
+    def _said(self, fault: Exception) -> str:
+        """Why there is no connection, in words."""
+        if isinstance(fault, ssl.SSLCertVerificationError):
+            return f"its certificate is not that of {self.caller.peer}: {fault.verify_message}"
+        said = str(getattr(fault, "strerror", "") or fault) or "no answer"
+        return f"{said}; {NOT_TRUSTED}" if self.tls is not None and isinstance(fault, ConnectionError) else said

@@ -51,6 +51,7 @@ MAX_CONTAINERS = 100_000
 """Most arrays and maps in one message: one byte each on the wire, some 70 in memory."""
 _UNCOUNTED = 64 * KIB
 _NUMBERS = frozenset((float, int))
+_TICK = Tick.KIND
 _ARRAY, _MESSAGE = 1, 2
 """msgpack extension types inside Tick: an array of numbers, a message."""
 
@@ -270,7 +271,13 @@ def decode_kind(body: bytes | memoryview, kind: int) -> Message:
     size = len(body)
     index = 2  # the map: all that a reader can find fault with
     try:
-        fields = _unpack(body, kind, size)
+        try:
+            if size <= _UNCOUNTED and kind != _TICK:
+                fields = _unpackb(body, ext_hook=_no_extension)
+            else:
+                fields = list(_unpack_counted(body, kind))
+        except Exception as fault:
+            raise _not_readable(fault) from None
         reader = READERS.get(kind)
         if reader is not None and (message := reader(fields, size <= NAME_LENGTH)) is not None:
             return message
@@ -302,16 +309,11 @@ class _Counter:
         return container
 
 
-def _unpack(body: bytes | memoryview, kind: int, size: int) -> list[Any]:
-    try:
-        if size <= _UNCOUNTED and kind != Tick.KIND:
-            return _unpackb(body, ext_hook=_no_extension)  # type: ignore[no-any-return]  # an array: `kind_of` saw its head
-        return list(_unpack_counted(body, kind))
-    except (_FieldError, NotPlainError, ProtocolError) as fault:
-        raise _FieldError(str(fault)) from None
-    except Exception as fault:
-        # msgpack raises its own kinds, ValueError, UnicodeDecodeError and RecursionError on bad bytes.
-        raise _FieldError(f"not msgpack: {type(fault).__name__}") from None
+def _not_readable(fault: Exception) -> _FieldError:
+    if isinstance(fault, (_FieldError, NotPlainError, ProtocolError)):
+        return _FieldError(str(fault))
+    # msgpack raises its own kinds, ValueError, UnicodeDecodeError and RecursionError on bad bytes.
+    return _FieldError(f"not msgpack: {type(fault).__name__}")
 
 
 def _unpack_counted(body: bytes | memoryview, kind: int) -> Any:

@@ -99,7 +99,8 @@ def inspect(value: Any, extra: frozenset[type] = frozenset(), depth: int = DEPTH
         for key, item in value.items():
             if type(key) is not str:
                 raise NotPlainError("a key of a map is not a str")
-            if type(item) not in SCALARS:
+            inner = type(item)
+            if inner not in SCALARS and not (inner is list and depth > 1 and SCALARS.issuperset(map(type, item))):
                 inspect(item, extra, depth - 1)
     elif kind is list or kind is tuple:
         if depth == 0:
