@@ -71,6 +71,8 @@ def make_mission(
     devices = {a.name: a.device for a in directory.actions.values() if a.device}
     engine = Engine(task, devices)
     executor = Executor(task, engine, directory, callers, mission, setting.seed, setting.selector, store or Forgetful())
+    if isinstance(setting.selector, Observer):
+        executor.observers.append(setting.selector)
     return Mission(executor, {**task.parameters, **setting.parameters}, runs)
 
 
@@ -138,10 +140,17 @@ def realtime_mission(directory: Directory, setting: Setting, mission: str, store
 
 
 def resumed_mission(
-    directory: Directory, task: Task, engine: Engine, journal: Journal, observers: Sequence[Observer], now: float
+    directory: Directory,
+    task: Task,
+    engine: Engine,
+    journal: Journal,
+    observers: Sequence[Observer],
+    now: float,
+    selector: Selector | None = None,
 ) -> tuple[Mission, Callable[[float], None]]:
     """A mission run as its journal left it, and what makes it go on once the nodes are there.
 
+    A selector that learns has to be among the observers too: the recorded steps bring it to where it was.
     Raises ReplayError when the engine does not derive what the journal says.
     """
     header = journal.header
@@ -153,9 +162,8 @@ def resumed_mission(
     origin = origin_of(header, now, steps[-1].time if steps else 0.0)
     name = NAME if header["mode"] == "lockstep" else header["mission"]
     callers = make_callers(directory, secrets.token_hex(8), epoch, name)
-    executor = Executor(
-        task, engine, directory, callers, header["mission"], header["seed"], store=JournalStore(writer, origin)
-    )
+    store, chosen = JournalStore(writer, origin), selector or FirstAlternative()
+    executor = Executor(task, engine, directory, callers, header["mission"], header["seed"], chosen, store)
     mission = Mission(executor, header["parameters"], header["runs"])
     executor.observers.extend(observers)
     for step in steps:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from coordinator.engine import Instruction, State, Stimulus
 from services.comm.notice import Progress
@@ -45,6 +45,7 @@ class Store(Protocol):
         """Whether every effect waits for a sync, also one that moves no hardware."""
 
 
+@runtime_checkable
 class Observer(Protocol):
     """Whoever follows the mission run: report, page, terminal."""
 
