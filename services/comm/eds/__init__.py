@@ -1,1 +1,1 @@
-"""Electronic data sheets (CiA 306) of the devices on the arm's bus."""
+"""Electronic data sheets (CiA 306) of the devices on the CAN buses."""
