@@ -104,8 +104,11 @@ class Caller:
         epoch: int = 0,
         boot: str = "",
         done: Callable[[m.Outcome], None] | None = None,
-    ) -> None:
-        """`call` by the fields of a Call. `done` is told its end in place of a notice, and its result acknowledged then."""
+    ) -> int:
+        """`call` by the fields of a Call. `done` is told its end in place of a notice, and its result acknowledged then.
+
+        Gives how many messages wait to be taken out.
+        """
         if id in self._pending:
             raise ValueError(f"call {id}: this id is under way already")
         if arguments:
@@ -118,6 +121,7 @@ class Caller:
             self._end(id, "refused", self._refusal, pending.if_unsent)
         elif self._held_until is None or now >= self._held_until:
             self._end(id, "unreachable", f"{self.peer} is not there", pending.if_unsent)
+        return len(self._messages)
 
     def cancel(self, now: float, id: str, reason: str = "", within: float | None = None) -> None:  # noqa: A002
         """Ask for a call's run to be stopped; it still ends with one `Ended`, `no_answer` if the peer does not say so
@@ -317,11 +321,6 @@ class Caller:
     def calls(self) -> int:
         """How many calls are under way."""
         return len(self._pending)
-
-    @property
-    def waiting(self) -> int:
-        """How many messages wait to be taken out."""
-        return len(self._messages)
 
     @property
     def has_news(self) -> bool:

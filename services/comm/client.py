@@ -175,8 +175,8 @@ class Client:
         future = _Asked(loop=self.loop)
         future.asked = self, id_
         caller = self.caller
-        caller.begin(now, id_, service, arguments, deadline, parent, seed, done=future.end)
-        if caller.calls == 1 or caller.waiting >= AT_ONCE:
+        waiting = caller.begin(now, id_, service, arguments, deadline, parent, seed, done=future.end)
+        if waiting >= AT_ONCE or caller.calls == 1:
             self.flush(now)
         elif not self._flushing:
             # Others are under way: let those that are made in this turn of the loop share a write.

@@ -16,37 +16,12 @@ from __future__ import annotations
 import struct
 from collections.abc import Mapping
 from dataclasses import replace
-from enum import Enum
 from typing import Final
 
 from services.comm.codec import LIMITS, ProtocolError, decode, decode_kind, encode, kind_of
-from services.comm.messages import (
-    Accept,
-    Answer,
-    Bye,
-    Call,
-    Cancel,
-    Challenge,
-    Command,
-    Event,
-    EventAck,
-    Feedback,
-    Hello,
-    Message,
-    Outcome,
-    Ping,
-    Pong,
-    Proof,
-    Refuse,
-    ResultAck,
-    SetPoint,
-    StreamOpen,
-    Subscribe,
-    Tick,
-    Welcome,
-    Withdraw,
-)
+from services.comm.messages import Challenge, Hello, Message, Proof, Refuse, Welcome
 from services.comm.security import NONCE_BYTES, PROOF_BYTES, SEAL_BYTES, Seal, proof, same
+from services.comm.turns import LAST, MAY_COME, MAY_GO, NOTHING, OVER, STATES, Phase, Side, State
 
 __all__ = ["NEWEST_VERSION", "OLDEST_VERSION", "Connection", "ProtocolError", "Side", "State", "negotiate"]
 
@@ -58,75 +33,6 @@ _HEADER: Final = 4
 _HEAD: Final = struct.Struct(">IBB")
 """Length, then the first two bytes of the body: its array and the kind."""
 _LARGE: Final = 4096
-
-
-class Side(Enum):
-    """Which end of the connection this is."""
-
-    CLIENT = "client"
-    SERVER = "server"
-
-
-class State(Enum):
-    """Where a connection stands."""
-
-    OPENING = "opening"
-    OPEN = "open"
-    CLOSING = "closing"
-    CLOSED = "closed"
-
-
-class _Phase(Enum):
-    """State in full: what the next message may be."""
-
-    HELLO = "hello"
-    """Nothing was said yet."""
-    HELLO_SENT = "hello sent"
-    CHALLENGED = "challenged"
-    """Server: proof awaited."""
-    PROVED = "proved"
-    """Client: proof sent."""
-    DECIDING = "deciding"
-    """Server: its owner answers WELCOME or REFUSE."""
-    OPEN = "open"
-    CLOSING = "closing"
-    CLOSED = "closed"
-
-
-_STATES: Mapping[_Phase, State] = {
-    _Phase.OPEN: State.OPEN,
-    _Phase.CLOSING: State.CLOSING,
-    _Phase.CLOSED: State.CLOSED,
-}
-
-_BOTH = frozenset(cls.KIND for cls in (Ping, Pong, Tick, Bye, Refuse))
-_FROM_CLIENT = _BOTH | {
-    cls.KIND for cls in (Call, ResultAck, Cancel, EventAck, Subscribe, Command, StreamOpen, SetPoint, Withdraw)
-}
-_FROM_SERVER = _BOTH | {cls.KIND for cls in (Accept, Feedback, Outcome, Event, Answer)}
-_NOTHING: frozenset[int] = frozenset()
-_REFUSE = frozenset((Refuse.KIND,))
-
-_MAY_COME: Mapping[tuple[Side, _Phase], frozenset[int]] = {
-    (Side.SERVER, _Phase.HELLO): frozenset((Hello.KIND,)),
-    (Side.SERVER, _Phase.CHALLENGED): _REFUSE | {Proof.KIND},
-    (Side.SERVER, _Phase.OPEN): _FROM_CLIENT,
-    (Side.CLIENT, _Phase.HELLO_SENT): _REFUSE | {Challenge.KIND, Welcome.KIND},
-    (Side.CLIENT, _Phase.PROVED): _REFUSE | {Welcome.KIND},
-    (Side.CLIENT, _Phase.OPEN): _FROM_SERVER,
-}
-_MAY_GO: Mapping[tuple[Side, _Phase], frozenset[int]] = {
-    (Side.CLIENT, _Phase.HELLO): frozenset((Hello.KIND,)),
-    (Side.CLIENT, _Phase.HELLO_SENT): _REFUSE,
-    (Side.CLIENT, _Phase.PROVED): _REFUSE,
-    (Side.CLIENT, _Phase.OPEN): _FROM_CLIENT,
-    (Side.SERVER, _Phase.HELLO): _REFUSE,
-    (Side.SERVER, _Phase.CHALLENGED): _REFUSE,
-    (Side.SERVER, _Phase.DECIDING): _REFUSE | {Welcome.KIND},
-    (Side.SERVER, _Phase.OPEN): _FROM_SERVER,
-}
-_LAST = frozenset((Bye.KIND, Refuse.KIND))
-_OVER = (_Phase.CLOSING, _Phase.CLOSED)
 _NO_QUICK: Mapping[int, int] = {}
 
 
@@ -150,7 +56,7 @@ class Connection:
         """Version agreed on; 0 before WELCOME."""
         self._key = key
         self._nonce = nonce
-        self._phase = _Phase.HELLO
+        self._phase = Phase.HELLO
         self._parts: list[bytes] = []
         self._have = 0
         self._need = 0
@@ -160,24 +66,27 @@ class Connection:
         self._seal_in: Seal | None = None
         self._seal_out: Seal | None = None
         self._seal_bytes = 0
-        self._may_come = _MAY_COME.get((side, self._phase), _NOTHING)
-        self._may_go = _MAY_GO.get((side, self._phase), _NOTHING)
+        self._may_come = MAY_COME.get((side, self._phase), NOTHING)
+        self._may_go = MAY_GO.get((side, self._phase), NOTHING)
         self._quick_in: Mapping[int, int] = _NO_QUICK
-        """While the connection is open: the kinds that may come and end nothing, with the longest frame of each (bytes)."""
+        """While the connection is open: the kinds that may come and end nothing, with the longest frame of each (bytes),"""
+        self._quick_out = NOTHING
+        """and those that may go so."""
 
     @property
     def state(self) -> State:
         """opening, open, closing or closed."""
-        return _STATES.get(self._phase, State.OPENING)
+        return STATES.get(self._phase, State.OPENING)
 
-    def _enter(self, phase: _Phase) -> None:
+    def _enter(self, phase: Phase) -> None:
         self._phase = phase
-        self._may_come = _MAY_COME.get((self.side, phase), _NOTHING)
-        self._may_go = _MAY_GO.get((self.side, phase), _NOTHING)
-        if phase is _Phase.OPEN:
-            self._quick_in = {kind: LIMITS[kind] + self._seal_bytes for kind in self._may_come - _LAST}
+        self._may_come = MAY_COME.get((self.side, phase), NOTHING)
+        self._may_go = MAY_GO.get((self.side, phase), NOTHING)
+        if phase is Phase.OPEN:
+            self._quick_in = {kind: LIMITS[kind] + self._seal_bytes for kind in self._may_come - LAST}
+            self._quick_out = self._may_go - LAST
         else:
-            self._quick_in = _NO_QUICK
+            self._quick_in, self._quick_out = _NO_QUICK, NOTHING
 
     def data_to_send(self) -> bytes:
         """Bytes that the handshake itself has to send; ask after each `receive_data`."""
@@ -187,17 +96,21 @@ class Connection:
 
     def send(self, message: Message) -> bytes:
         """Bytes of a message. Raises ProtocolError if it is too large or may not be sent now; then nothing has changed."""
-        kind = message.KIND
-        if kind not in self._may_go:
-            raise ProtocolError("out_of_turn", f"{type(message).__name__} cannot be sent while {self._phase.value}")
-        if self._phase is not _Phase.OPEN:
-            return self._send_opening(message)
+        if message.KIND not in self._quick_out:
+            return self._send_unusual(message)
         body = encode(message)
-        if kind in _LAST:
-            self._enter(_Phase.CLOSING)
         if self._seal_out is not None:
             return (len(body) + SEAL_BYTES).to_bytes(_HEADER, "big") + body + self._seal_out.next(body)
         return len(body).to_bytes(_HEADER, "big") + body
+
+    def _send_unusual(self, message: Message) -> bytes:
+        if message.KIND not in self._may_go:
+            raise ProtocolError("out_of_turn", f"{type(message).__name__} cannot be sent while {self._phase.value}")
+        if self._phase is not Phase.OPEN:
+            return self._send_opening(message)
+        last_word = self._frame(encode(message))
+        self._enter(Phase.CLOSING)
+        return last_word
 
     def refusal(self, refuse: Refuse) -> bytes:
         """Bytes of the last word to a side that has broken the protocol, sealed if the connection was open."""
@@ -213,12 +126,12 @@ class Connection:
             message = replace(message, auth=self._nonce if self._key is not None else b"")
             body = encode(message)
             self._transcript = body
-            self._enter(_Phase.HELLO_SENT)
+            self._enter(Phase.HELLO_SENT)
         elif isinstance(message, Welcome):
             body = self._welcome_body(message)
         else:
             body = encode(message)
-            self._enter(_Phase.CLOSING)
+            self._enter(Phase.CLOSING)
         data = self._frame(body)
         if isinstance(message, Welcome):
             self._open(message.version)
@@ -239,7 +152,7 @@ class Connection:
             self._seal_out = Seal(self._key, mine, self._transcript)
             self._seal_in = Seal(self._key, theirs, self._transcript)
             self._seal_bytes = SEAL_BYTES
-        self._enter(_Phase.OPEN)
+        self._enter(Phase.OPEN)
 
     def receive_data(self, data: bytes) -> list[Message]:
         """Messages completed by these bytes, in order.
@@ -254,7 +167,7 @@ class Connection:
                 return []
             data = b"".join(self._parts)
             self._parts.clear()
-        elif self._phase in _OVER:
+        elif self._phase in OVER:
             return []
         messages: list[Message] = []
         try:
@@ -262,7 +175,7 @@ class Connection:
             if start < len(data):
                 self._frames(data, start, messages)
         except ProtocolError as fault:
-            self._enter(_Phase.CLOSED)
+            self._enter(Phase.CLOSED)
             raise ProtocolError(fault.code, fault.text, messages) from None
         return messages
 
@@ -326,10 +239,10 @@ class Connection:
     def _take(self, data: bytes, start: int, end: int) -> Message | None:
         body = data[start:end] if self._seal_in is None else self._unsealed(data, start, end)
         message = decode(body)
-        if self._phase is not _Phase.OPEN:
+        if self._phase is not Phase.OPEN:
             return self._take_opening(message, bytes(body))
-        if message.KIND in _LAST:
-            self._enter(_Phase.CLOSED)
+        if message.KIND in LAST:
+            self._enter(Phase.CLOSED)
         return message
 
     def _take_opening(self, message: Message, body: bytes) -> Message | None:
@@ -343,7 +256,7 @@ class Connection:
         if isinstance(message, Welcome):
             self._take_welcome(message, body)
             return message
-        self._enter(_Phase.CLOSED)
+        self._enter(Phase.CLOSED)
         return message
 
     def _take_hello(self, hello: Hello, body: bytes) -> Hello | None:
@@ -359,7 +272,7 @@ class Connection:
                 raise ProtocolError(
                     "no_key_here", "this side has no key: give it the same key file, or take yours away"
                 )
-            self._enter(_Phase.DECIDING)
+            self._enter(Phase.DECIDING)
             return hello
         if len(hello.auth) != NONCE_BYTES:
             raise ProtocolError("key_needed", "this side asks for a key: give the other side the same key file")
@@ -367,7 +280,7 @@ class Connection:
         challenge = encode(Challenge(self._nonce))
         self._transcript += challenge
         self._out += self._frame(challenge)
-        self._enter(_Phase.CHALLENGED)
+        self._enter(Phase.CHALLENGED)
         return None
 
     def _take_challenge(self, challenge: Challenge, body: bytes) -> None:
@@ -377,17 +290,17 @@ class Connection:
             raise ProtocolError("malformed", f"a nonce of {len(challenge.auth)} bytes")
         self._transcript += body
         self._out += self._frame(encode(Proof(proof(self._key, "client", self._transcript))))
-        self._enter(_Phase.PROVED)
+        self._enter(Phase.PROVED)
 
     def _take_proof(self, given: Proof) -> Hello | None:
         if self._key is None or not same(given.auth, proof(self._key, "client", self._transcript)):
             raise ProtocolError("wrong_key", "the client's key is not this side's key: use the same key file")
-        self._enter(_Phase.DECIDING)
+        self._enter(Phase.DECIDING)
         return self._hello
 
     def _take_welcome(self, welcome: Welcome, body: bytes) -> None:
         if self._key is not None:
-            if self._phase is not _Phase.PROVED:
+            if self._phase is not Phase.PROVED:
                 raise ProtocolError("no_key_there", "the server did not ask for the key: give it the same key file")
             expected = proof(self._key, "server", self._transcript + body[:-PROOF_BYTES])
             if not same(welcome.auth, expected):
