@@ -13,7 +13,7 @@ from enum import Enum, auto
 
 from services.comm.messages import Bye, Event, Feedback, Message, Ping, Pong, Refuse
 from services.comm.security import NONCE_BYTES
-from services.comm.wire import Connection, ProtocolError, Side
+from services.comm.wire import Connection, ProtocolError, Side, State
 
 READ_BUFFER = 1 << 18
 """Bytes read at once."""
@@ -131,6 +131,10 @@ class Link(asyncio.BufferedProtocol):
     def took(self, now: float, messages: list[Message]) -> None:
         """Messages came."""
 
+    def beaten(self, now: float, count: int) -> bool:
+        """So many heartbeats came; False: the link has been ended for it."""
+        return True
+
     def over(self, now: float) -> None:
         """The link is over, `reason` says why. Called once."""
 
@@ -177,6 +181,8 @@ class Link(asyncio.BufferedProtocol):
         last = messages[-1]
         pings = [message for message in messages if type(message) in _HEARTBEATS]
         if pings:
+            if not self.beaten(now, len(pings)):
+                return
             messages = [message for message in messages if type(message) not in _HEARTBEATS]
             self.send([Pong(ping.number) for ping in pings if type(ping) is Ping])
         if messages:
@@ -237,6 +243,8 @@ class Link(asyncio.BufferedProtocol):
         try:
             return self.connection.send(message)
         except ProtocolError as fault:
+            if self.connection.state is not State.OPEN:
+                return b""  # its last word came with what is being answered: nobody listens any more
             instead = self.unsendable(message, fault)
             return b"" if instead is None else self.connection.send(instead)
 

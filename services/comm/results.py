@@ -6,6 +6,7 @@ import math
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from services.comm.messages import Outcome
 
@@ -17,13 +18,31 @@ class Keeping:
     results: float = 600.0
     """Seconds that an unacknowledged result is kept,"""
     result_count: int = 1_000
-    """and how many of them."""
+    """and how many of them,"""
+    result_bytes: int = 64 << 20
+    """and how much they may weigh together (bytes, about as on the wire); the newest is kept whatever it weighs."""
     ids: float = 3_600.0
     """Seconds that an id whose result is gone is remembered,"""
     id_count: int = 200_000
     """and how many of them."""
     lease: float = 2.0
     """Seconds after which the lease of a device is free when its holder is away and none of its runs goes on."""
+
+
+_SCALAR = 9
+"""Bytes of a number on the wire."""
+
+
+def weight_of(value: Any) -> int:
+    """About how many bytes plain data takes on the wire."""
+    kind = type(value)
+    if kind is str or kind is bytes:
+        return len(value) + _SCALAR
+    if kind is dict:
+        return _SCALAR + sum(len(key) + weight_of(item) for key, item in value.items())
+    if kind is list or kind is tuple:
+        return _SCALAR + sum(map(weight_of, value))
+    return _SCALAR
 
 
 class ResultStore:
@@ -33,7 +52,8 @@ class ResultStore:
         self._keeping = keeping
         self._forgotten = forgotten
         # A plain dict is slow to find its first entry once many were deleted before it.
-        self._results: OrderedDict[str, tuple[Outcome, str, float]] = OrderedDict()
+        self._results: OrderedDict[str, tuple[Outcome, str, float, int]] = OrderedDict()
+        self._weight = 0
         self._ids: OrderedDict[str, float] = OrderedDict()
         self._ids_due = math.inf
         """Not later than when the oldest id has been remembered long enough (s)."""
@@ -43,8 +63,13 @@ class ResultStore:
 
     def add(self, now: float, peer: str, outcome: Outcome) -> None:
         """Keep a result for its caller."""
-        self._results[outcome.id] = (outcome, peer, now)
-        if len(self._results) > self._keeping.result_count:
+        weight = weight_of(outcome.values) if outcome.values else 0
+        older = self._results.get(outcome.id)
+        self._weight += weight - (older[3] if older is not None else 0)
+        self._results[outcome.id] = (outcome, peer, now, weight)
+        while len(self._results) > self._keeping.result_count or (
+            self._weight > self._keeping.result_bytes and len(self._results) > 1
+        ):
             self._forget(now, next(iter(self._results)))
 
     def get(self, id_: str) -> Outcome | None:
@@ -65,11 +90,11 @@ class ResultStore:
 
     def of(self, peer: str) -> list[str]:
         """Ids of the results kept for this caller."""
-        return [id_ for id_, (_, owner, _) in self._results.items() if owner == peer]
+        return [id_ for id_, (_, owner, _, _) in self._results.items() if owner == peer]
 
     def due(self) -> float | None:
         """When the oldest result has been kept long enough (s)."""
-        for _, _, at in self._results.values():
+        for _, _, at, _ in self._results.values():
             return at + self._keeping.results
         return None
 
@@ -79,7 +104,7 @@ class ResultStore:
             self._forget(now, next(iter(self._results)))
 
     def _forget(self, now: float, id_: str) -> None:
-        del self._results[id_]
+        self._weight -= self._results.pop(id_)[3]
         self._ids[id_] = now
         if now >= self._ids_due or len(self._ids) > self._keeping.id_count:
             self._forget_ids(now)

@@ -21,7 +21,7 @@ from services.comm.credentials import may_speak_as, name_on
 from services.comm.link import READ_BUFFER, Limits, Link, Timing
 from services.comm.messages import Answer, Bye, Call, Hello, Message, Outcome, Refuse
 from services.comm.security import is_loopback, require_key
-from services.comm.tls_listener import TlsListener
+from services.comm.tls_listener import Admission, TlsListener
 from services.comm.wire import ProtocolError, Side, State
 
 OnOrders = Callable[[float, list[Order]], None]
@@ -76,6 +76,10 @@ class _ServerLink(Link):
             self._server.flush(now)
         else:
             self._server.arm()
+
+    def beaten(self, now: float, count: int) -> bool:
+        self._taken += count
+        return self._taken < COUNTED or self._in_time(now)
 
     def _in_time(self, now: float) -> bool:
         """Read no more for a while from one that sends faster than it may; False: it is too much, and it must go."""
@@ -184,7 +188,7 @@ class Server:
         else:
             listener = TlsListener(host, port, self.tls, self.timing.handshake, self.limits.opening)
             self._server = listener
-            listener.start(lambda: _ServerLink(self), self.admits, self.failed)
+            listener.start(Admission(lambda: _ServerLink(self), self.admits, self.failed))
 
     @property
     def address(self) -> tuple[str, int]:
@@ -270,7 +274,10 @@ class Server:
         self._all.add(link)
         self._opening[link] = None
         if len(self._opening) > self.limits.opening or len(self._all) > self.limits.connections:
-            next(iter(self._opening)).cut("too many connections")
+            oldest = next(iter(self._opening))
+            self._opening.pop(oldest)  # now: it is told of its end in a later turn of the loop only
+            self.failed(oldest.address)
+            oldest.cut("too many connections")
 
     def welcomed(self, link: _ServerLink) -> None:
         """A caller has been welcomed; an older connection of its name is cut."""

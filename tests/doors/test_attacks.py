@@ -1,0 +1,492 @@
+"""Attacks on a node's door over real sockets: refused in clear words or cut off, memory bounded, a good client served."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import random
+import struct
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from services.comm import messages as m
+from services.comm.wire import Connection, ProtocolError, Side
+from tests.doors.conftest import HELLO, KEY, MIB, GoodClient, Stranger, Victim, frame
+
+pytestmark = pytest.mark.processes
+Start = Callable[..., Victim]
+STRANGE = m.Hello(1, 1, "client", "mallory", "m1")
+TOLERATED = 24 * MIB
+"""By how much the victim's resident set may grow while it is attacked."""
+
+
+# --- handshakes and frames that are no good ------------------------------------------------------------------------------
+
+
+async def wrong_key(stranger: Stranger) -> None:
+    """A guessed key."""
+    with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError, ProtocolError):
+        await stranger.open(bytes(32), STRANGE)
+
+
+async def no_key(stranger: Stranger) -> None:
+    """No key at all."""
+    await stranger.say(frame(STRANGE))
+
+
+async def older_version(stranger: Stranger) -> None:
+    """A version with fewer checks, if there ever was one."""
+    await stranger.say(frame(m.Hello(0, 0, "client", "mallory", "m1", auth=bytes(32))))
+
+
+async def newer_version(stranger: Stranger) -> None:
+    """A version that is not spoken here."""
+    await stranger.say(frame(m.Hello(7, 9, "client", "mallory", "m1", auth=bytes(32))))
+
+
+async def downgraded_version(stranger: Stranger) -> None:
+    """Somebody between the two changes the versions of an honest HELLO: the proof is of another transcript."""
+    honest = Connection(Side.CLIENT, key=KEY, nonce=bytes(32))
+    hello = honest.send(m.Hello(1, 4, "client", "ana", "a1"))
+    await stranger.say(hello.replace(struct.pack("BB", 1, 4), struct.pack("BB", 1, 1), 1))
+    body = await stranger._body()
+    honest.receive_data(len(body).to_bytes(4, "big") + body)
+    await stranger.say(honest.data_to_send())
+
+
+async def old_epoch(stranger: Stranger) -> None:
+    """A coordinator of a time before, with the right key."""
+    with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError, ProtocolError):
+        await stranger.open(KEY, m.Hello(1, 1, "coordinator", "coord", "c0", 2))
+
+
+async def taken_name(stranger: Stranger) -> None:
+    """Another process under the good client's name and epoch."""
+    with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError, ProtocolError):
+        await stranger.open(KEY, m.Hello(1, 1, "coordinator", "coord", "c9", 3))
+
+
+async def repeated_frame(stranger: Stranger) -> None:
+    """The same sealed CALL twice."""
+    connection = await stranger.open(KEY, STRANGE)
+    sealed = connection.send(m.Call("m/1", "echo"))
+    await stranger.say(sealed + sealed)
+
+
+async def left_out_frame(stranger: Stranger) -> None:
+    """A sealed CALL kept back, the next one passed on."""
+    connection = await stranger.open(KEY, STRANGE)
+    connection.send(m.Call("m/1", "echo"))
+    await stranger.say(connection.send(m.Call("m/2", "echo")))
+
+
+async def changed_frame(stranger: Stranger) -> None:
+    """One bit of a sealed CALL changed on its way."""
+    connection = await stranger.open(KEY, STRANGE)
+    sealed = bytearray(connection.send(m.Call("m/1", "echo", {"speed": 0.1})))
+    sealed[-20] ^= 1
+    await stranger.say(bytes(sealed))
+
+
+async def unsealed_frame(stranger: Stranger) -> None:
+    """A CALL without a seal on a connection that has one."""
+    await stranger.open(KEY, STRANGE)
+    await stranger.say(frame(m.Call("m/1", "echo", {"much": "x" * 60})))
+
+
+async def oversized_hello(stranger: Stranger) -> None:
+    """A length of 4 GiB, refused from its first six bytes."""
+    await stranger.say(b"\xff\xff\xff\xff" + frame(STRANGE)[4:])
+
+
+async def oversized_call(stranger: Stranger) -> None:
+    """17 MiB announced on an open connection."""
+    await stranger.open(KEY, STRANGE)
+    await stranger.say((17 * MIB).to_bytes(4, "big") + frame(m.Call("m/1", "echo"))[4:])
+
+
+async def out_of_turn(stranger: Stranger) -> None:
+    """A CALL before HELLO."""
+    await stranger.say(frame(m.Call("m/1", "echo")))
+
+
+async def sealed(stranger: Stranger, body: bytes) -> None:
+    """Any body, sealed as it should be."""
+    connection = await stranger.open(KEY, STRANGE)
+    await stranger.say(connection._frame(body))
+
+
+async def deep_message(stranger: Stranger) -> None:
+    """Arguments nested 5,000 deep."""
+    await sealed(stranger, b"\x94\x04\xa3m/1\xa4echo" + b"\x81\xa1a" * 5_000 + b"\xc0")
+
+
+async def many_containers(stranger: Stranger) -> None:
+    """A million empty arrays: 1 MB on the wire, 70 in memory if they were all made."""
+    await sealed(stranger, b"\x94\x04\xa3m/1\xa4echo\x81\xa1a" + b"\xdd" + (10**6).to_bytes(4, "big") + b"\x90" * 10**6)
+
+
+async def strange_extension(stranger: Stranger) -> None:
+    """A type that msgpack lets everybody define."""
+    await sealed(stranger, msgpack.packb([4, "m/1", "echo", {"x": msgpack.ExtType(5, b"0" * 100)}]))
+
+
+ATTACKS: list[tuple[Callable[[Stranger], Awaitable[None]], str]] = [
+    (wrong_key, "wrong_key"),
+    (no_key, "key_needed"),
+    (older_version, "version"),
+    (newer_version, "version"),
+    (downgraded_version, "wrong_key"),
+    (old_epoch, "old_epoch"),
+    (taken_name, "name_taken"),
+    (repeated_frame, "bad_seal"),
+    (left_out_frame, "bad_seal"),
+    (changed_frame, "bad_seal"),
+    (unsealed_frame, "bad_seal"),
+    (oversized_hello, "too_large"),
+    (oversized_call, "too_large"),
+    (out_of_turn, "out_of_turn"),
+    (deep_message, "malformed"),
+    (many_containers, "malformed"),
+    (strange_extension, "malformed"),
+]
+
+
+async def test_every_attack_is_refused_in_clear_words(victim: Start) -> None:
+    """One after the other against one server: the code is the right one, its memory stays, the good client notices nothing."""
+    server = victim(key=KEY.hex())
+    async with server.good_client() as good:
+        codes: dict[str, str] = {}
+        for attack, _ in ATTACKS:
+            stranger = await Stranger.at(server)
+            await attack(stranger)
+            codes[attack.__name__] = await stranger.refused()
+            stranger.close()
+            await good.still_served(2)
+        assert codes == {attack.__name__: code for attack, code in ATTACKS}
+        assert server.about(deep=True)["links"] == 1
+    assert server.grown() < TOLERATED
+
+
+async def test_a_recorded_session_opens_nothing(victim: Start) -> None:
+    """All that a good client said, replayed to the same server and to another boot of it: its challenge is another one."""
+    for server in (victim(key=KEY.hex()), victim(key=KEY.hex())):
+        session = await Stranger.at(server)
+        connection = await session.open(KEY, STRANGE)
+        await session.say(connection.send(m.Call("m/1", "echo", {"n": 1})))
+        assert isinstance(decoded := await session._body(), bytes) and b"success" in decoded
+        session.close()
+        replay = await Stranger.at(server)
+        await replay.say(session.said)
+        assert await replay.refused() == "wrong_key"
+        replay.close()
+
+
+async def test_what_a_server_said_is_no_proof_of_its_key(victim: Start) -> None:
+    """A stranger who plays a recorded server to a client: the client hears another nonce's proof, and trusts nothing."""
+    server = victim(key=KEY.hex())
+    session = await Stranger.at(server)
+    await session.open(KEY, STRANGE)
+    session.close()
+
+    async def impostor(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.read(64)
+        writer.write(session.heard)
+        with contextlib.suppress(ConnectionError):
+            await reader.read()
+        writer.close()
+        with contextlib.suppress(ConnectionError):
+            await writer.wait_closed()
+        over.set()
+
+    over = asyncio.Event()
+    fake = await asyncio.start_server(impostor, "127.0.0.1", 0)
+    connection = Connection(Side.CLIENT, key=KEY, nonce=os.urandom(32))
+    reader, writer = await asyncio.open_connection(*fake.sockets[0].getsockname())
+    writer.write(connection.send(HELLO))
+    with pytest.raises(ProtocolError, match="wrong_key"):
+        while data := await reader.read(4096):
+            connection.receive_data(data)
+            writer.write(connection.data_to_send())
+    writer.close()
+    await writer.wait_closed()
+    async with asyncio.timeout(20.0):
+        await over.wait()
+    fake.close()
+    await fake.wait_closed()
+
+
+# --- too many, too slow, too fast ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("keyed", [False, True], ids=["plain", "sealed"])
+async def test_slow_loris(victim: Start, keyed: bool) -> None:
+    """Two hundred connections that drip a HELLO byte by byte: none lasts, none keeps the good client out."""
+    server = victim(timing={"handshake": 0.5}, **({"key": KEY.hex()} if keyed else {}))
+    hello = frame(m.Hello(1, 1, "client", "mallory", "m1", auth=bytes(32) if keyed else b""))
+
+    async def drip() -> None:
+        stranger = await Stranger.at(server)
+        for byte in hello:
+            await stranger.say(bytes([byte]))
+            await asyncio.sleep(0.05)
+            if stranger.writer.is_closing() or stranger.reader.at_eof():
+                break
+        assert stranger.reader.at_eof() or stranger.writer.is_closing() or await stranger.refused() == ""
+        stranger.close()
+
+    async with server.good_client() as good:
+        dripping = [asyncio.create_task(drip()) for _ in range(200)]
+        await good.still_served(50)
+        async with server_second(server) as second:
+            await second.still_served(5)
+        await asyncio.gather(*dripping, return_exceptions=True)
+        await good.still_served()
+        assert server.about(deep=True)["links"] == 1
+    assert server.grown() < TOLERATED
+
+
+def server_second(server: Victim) -> Any:
+    """Another good client, who comes while the attack goes on."""
+    return _second(server)
+
+
+@contextlib.asynccontextmanager
+async def _second(server: Victim) -> Any:
+    good = GoodClient(server.client(m.Hello(1, 1, "coordinator", "second", "s1", 1)))
+    await good.begin()
+    try:
+        yield good
+    finally:
+        await good.end()
+
+
+BOUNDED_FILES = 64 + 2 * 128 + 2 * 64 + 40
+"""Strangers that are waited for, those that one turn of the loop takes from the socket's queue and those that it closes, and
+what a process has open anyway."""
+CROWD = """
+import json, resource, select, socket, sys
+host, port, count = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+crowd = []
+for _ in range(count):
+    one = socket.socket()
+    one.setblocking(False)
+    one.connect_ex((host, port))
+    crowd.append(one)
+    if len(crowd) % 50 == 0:
+        select.select([], [], [], 0.005)
+print(len(crowd), flush=True)
+sys.stdin.readline()
+"""
+
+
+@contextlib.asynccontextmanager
+async def crowd_at(server: Victim, count: int) -> Any:
+    """A process that opens so many connections and keeps them."""
+    command = [sys.executable, "-c", textwrap.dedent(CROWD), *map(str, (*server.address, count))]
+    crowd = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        yield crowd
+    finally:
+        crowd.kill()
+        crowd.communicate()
+
+
+@pytest.mark.parametrize("door", ["plain", "sealed", "TLS"])
+async def test_ten_thousand_connections(victim: Start, door: str, certificates: Path, many_files: None) -> None:
+    """Connections, descriptors and memory stay bounded; who was there is served all the time, and a newcomer gets in."""
+    how: dict[str, Any] = {"plain": {}, "sealed": {"key": KEY.hex()}, "TLS": {"folder": str(certificates)}}[door]
+    server = victim(**how)
+    async with server.good_client() as good, crowd_at(server, 10_000) as crowd:
+        assert crowd.stdout is not None
+        opened = asyncio.create_task(asyncio.to_thread(crowd.stdout.readline))
+        while not opened.done():
+            await good.still_served(10)
+            about = await asyncio.to_thread(server.about)
+            assert about["opening"] <= 64 and about["fds"] < BOUNDED_FILES, about
+        assert int(await opened) == 10_000
+        async with _second(server) as second:
+            await second.still_served()
+        await good.still_served()
+    assert server.grown() < (TOLERATED if door != "TLS" else 64 * MIB)
+
+
+async def test_who_fails_too_often_is_not_listened_to(victim: Start) -> None:
+    """Guessing keys from one address: after some failures it is cut before it says a word; other addresses are served."""
+    limits = {"handshakes": 0.001, "handshakes_at_once": 10, "spare_loopback": False}
+    server = victim(key=KEY.hex(), limits=limits)
+    async with server.good_client() as good:
+        codes = []
+        for _ in range(20):
+            stranger = await Stranger.at(server, source="127.0.0.2")
+            await wrong_key(stranger)
+            codes.append(await stranger.refused())
+            stranger.close()
+        assert codes[:10] == ["wrong_key"] * 10 and set(codes[12:]) == {""}
+        assert server.about()["faults"]["knocks"] >= 8
+        await good.still_served()
+        async with _second(server) as second:
+            await second.still_served()
+
+
+async def test_a_flood_of_messages_is_held_back(victim: Start) -> None:
+    """A caller who sends far more than it may is sent away, one who sends a bit more is kept waiting; the others go on."""
+    server = victim(limits={"messages": 500.0, "messages_at_once": 1_000})
+    usual = victim(limits={"messages": 60_000.0, "messages_at_once": 1_000})
+    for one, stays in ((server, False), (usual, True)):
+        async with one.good_client() as good:
+            flood = await Stranger.at(one)
+            await flood.open(None, STRANGE)
+            burst = b"".join(frame(m.Ping(n)) for n in range(4_000))
+            sending = asyncio.create_task(_flood(flood, burst, 60))
+            await good.still_served(30)
+            sending.cancel()
+            await asyncio.gather(sending, return_exceptions=True)
+            about = one.about()
+            assert about["faults"].get("too_fast", 0) > 0
+            assert ("mallory" in about["connected"]) is stays
+            flood.close()
+            await good.still_served()
+        assert one.grown() < TOLERATED
+
+
+async def _flood(stranger: Stranger, burst: bytes, times: int) -> None:
+    async def swallow() -> None:
+        while await stranger.reader.read(1 << 16):
+            pass
+
+    swallowing = asyncio.create_task(swallow())
+    for _ in range(times):
+        with contextlib.suppress(ConnectionError):
+            stranger.writer.write(burst)
+            await stranger.writer.drain()
+    swallowing.cancel()
+    await asyncio.gather(swallowing, return_exceptions=True)
+
+
+async def test_results_that_nobody_fetches_do_not_fill_the_memory(victim: Start) -> None:
+    """A caller who acknowledges nothing: what is kept for it is bounded by bytes, not by number alone."""
+    server = victim(keeping={"result_bytes": 8 * MIB})
+    async with server.good_client() as good:
+        stranger = await Stranger.at(server)
+        await stranger.open(None, STRANGE)
+        for number in range(80):
+            await stranger.say(frame(m.Call(f"m/{number}", "big", {"bytes": MIB // 2})))
+            while not isinstance(answer := await stranger.hears(), m.Outcome):
+                await stranger.say(frame(m.Pong(1)))
+            assert answer.status == "success"
+        stranger.said = stranger.heard = b""
+        await stranger.say(frame(m.Call("m/79", "big", {"bytes": 1})))
+        kept = await stranger.hears()
+        assert isinstance(kept, m.Outcome) and len(kept.values["b"]) == MIB // 2, "the newest is still there"
+        await stranger.say(frame(m.Call("m/0", "big", {"bytes": 1})))
+        forgotten = await stranger.hears()
+        assert isinstance(forgotten, m.Outcome) and forgotten.cause == "forgotten"
+        await good.still_served()
+        stranger.close()
+    assert server.grown() < 8 * MIB + TOLERATED
+
+
+# --- random bytes ----------------------------------------------------------------------------------------------------------
+
+
+def random_bytes(chance: random.Random) -> bytes:
+    """A connection's worth of bytes: noise, or a good beginning with some of it changed."""
+    good = bytearray(frame(STRANGE) + frame(m.Call("m/1", "echo", {"x": [1, 2, {"y": "z"}]})) + frame(m.Ping(1)))
+    if chance.random() < 0.3:
+        return chance.randbytes(chance.randrange(1, 400))
+    for _ in range(chance.randrange(1, 6)):
+        good[chance.randrange(len(good))] = chance.randrange(256)
+    if chance.random() < 0.3:
+        good += chance.randbytes(chance.randrange(1, 5_000))
+    return bytes(good)
+
+
+async def _bombard(server: Victim, over: Callable[[int], bool], seed: int) -> int:
+    chance, sent = random.Random(seed), 0
+    while not over(sent):
+        with contextlib.suppress(ConnectionError):
+            stranger = await Stranger.at(server)
+            await stranger.say(random_bytes(chance))
+            stranger.writer.transport.abort()
+        sent += 1
+    return sent
+
+
+@pytest.mark.parametrize("keyed", [False, True], ids=["plain", "sealed"])
+async def test_random_bytes(victim: Start, keyed: bool) -> None:
+    """A few hundred connections full of them."""
+    server = victim(**({"key": KEY.hex()} if keyed else {}))
+    async with server.good_client() as good:
+        await asyncio.gather(*(_bombard(server, lambda n: n >= 100, seed) for seed in range(4)))
+        await good.still_served()
+    assert server.grown() < TOLERATED
+
+
+@pytest.mark.proof
+@pytest.mark.parametrize("keyed", [False, True], ids=["plain", "sealed"])
+async def test_random_bytes_for_minutes(victim: Start, keyed: bool) -> None:
+    """The same for two minutes each."""
+    server = victim(**({"key": KEY.hex()} if keyed else {}))
+    end = time.monotonic() + 120.0
+    async with server.good_client() as good:
+        sent = await asyncio.gather(*(_bombard(server, lambda _: time.monotonic() > end, s) for s in range(4)))
+        assert sum(sent) > 1_000
+        await good.still_served()
+        assert server.about(deep=True)["links"] == 1
+    assert server.grown() < TOLERATED
+
+
+def feed(data: bytes) -> None:
+    """Both ends of the protocol, in every state that a stranger can reach, given these bytes; nothing but ProtocolError."""
+    for key in (None, KEY):
+        for side in Side:
+            connection = Connection(side, key=key, nonce=bytes(32) if key else b"")
+            if side is Side.CLIENT:
+                connection.send(HELLO)
+            with contextlib.suppress(ProtocolError):
+                for message in connection.receive_data(data):
+                    if isinstance(message, m.Hello):
+                        connection.send(m.Welcome(1, "vision", "v1"))
+                connection.receive_data(data)
+
+
+@given(st.binary(max_size=600), st.integers(0, 200))
+@settings(suppress_health_check=[HealthCheck.too_slow], deadline=None)
+def test_arbitrary_bytes_raise_nothing_but_protocol_error(data: bytes, kept: int) -> None:
+    """Alone, and after a good beginning."""
+    feed(data)
+    feed((frame(STRANGE) + frame(m.Call("m/1", "echo")))[:kept] + data)
+
+
+FUZZ = """
+import sys
+sys.path.insert(0, {root!r})
+import atheris
+with atheris.instrument_imports(include=["services.comm"]):
+    from tests.doors.test_attacks import feed
+atheris.Setup([sys.argv[0], "-max_total_time=180", "-max_len=4096", "-rss_limit_mb=1024"], feed)
+atheris.Fuzz()
+"""
+
+
+@pytest.mark.proof
+def test_coverage_guided_bytes_for_minutes() -> None:
+    """Three minutes of atheris, where it is installed: it looks for bytes that reach new code."""
+    pytest.importorskip("atheris")
+    root = str(Path(__file__).resolve().parents[2])
+    done = subprocess.run([sys.executable, "-c", FUZZ.format(root=root)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]

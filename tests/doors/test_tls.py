@@ -1,0 +1,228 @@
+"""Mutual TLS between real sockets: who has the cell's certificates is let in, under the name on them, and nobody else."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import ssl
+import stat
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from coordinator.certificates import CertificateError, make_certificates
+from coordinator.cli import main
+from services.comm import messages as m
+from services.comm.caller import Caller
+from services.comm.client import Client
+from services.comm.credentials import Credentials, may_speak_as
+from services.comm.security import KeyFileError
+from tests.doors.conftest import HELLO, Victim
+
+ROOT = Path(__file__).parents[2]
+Start = Callable[..., Victim]
+
+
+async def outcome_of(client: Client) -> m.Outcome:
+    """What becomes of one call."""
+    client.start()
+    try:
+        async with asyncio.timeout(20.0):
+            return await client.call("echo", {"n": 1})
+    finally:
+        await client.close()
+
+
+def context(folder: Path, party: str) -> ssl.SSLContext:
+    """What a client shows that has this party's certificate."""
+    made = Credentials(party, None, folder).client()
+    assert made is not None
+    return made
+
+
+async def test_who_has_a_certificate_of_the_cell_is_served(victim: Start, certificates: Path) -> None:
+    """TLS 1.3, both ends certified; a large message crosses it whole."""
+    server = victim(folder=str(certificates))
+    client = server.client()
+    client.start()
+    async with asyncio.timeout(20.0):
+        assert (await client.call("echo", {"n": 1})).values == {"n": 1}
+        big = (await client.call("echo", {"b": bytes(3 << 20)})).values
+    assert big == {"b": bytes(3 << 20)}
+    link = client._link
+    assert link is not None and link._transport is not None
+    assert link._transport.get_extra_info("ssl_object").version() == "TLSv1.3"
+    await client.close()
+
+
+async def test_a_certificate_of_another_authority_is_refused(victim: Start, certificates: Path, tmp_path: Path) -> None:
+    """A stranger who made certificates of its own, with all the right names: neither end trusts the other."""
+    make_certificates(tmp_path / "own", ["coordinator", "vision"])
+    server = victim(folder=str(certificates))
+    client = server.client(tls=context(tmp_path / "own", "coordinator"))
+    assert (await outcome_of(client)).cause in ("unreachable", "lost")
+    assert "certificate" in client.trouble
+    trusting = tmp_path / "mixed"  # even a client that trusts the server is not trusted by it
+    shutil.copytree(tmp_path / "own", trusting)
+    shutil.copy(certificates / "ca.pem", trusting / "ca.pem")
+    client = server.client(tls=context(trusting, "coordinator"))
+    outcome = await outcome_of(client)
+    assert outcome.status == "error" and outcome.executed is not m.Executed.YES
+    async with server.good_client() as good:
+        await good.still_served()
+
+
+async def test_without_a_certificate_nobody_is_let_in(victim: Start, certificates: Path) -> None:
+    """Neither plainly nor with TLS alone."""
+    server = victim(folder=str(certificates))
+    bare = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    bare.load_verify_locations(certificates / "ca.pem")
+    for tls in (None, bare):
+        outcome = await outcome_of(Client(*server.address, Caller("vision", HELLO, auto_ack=True), tls=tls))
+        assert outcome.status == "error" and outcome.executed is not m.Executed.YES
+    assert server.about()["connected"] == []
+
+
+async def test_older_tls_is_refused(victim: Start, certificates: Path) -> None:
+    """No way down to TLS 1.2."""
+    server = victim(folder=str(certificates))
+    old = context(certificates, "coordinator")
+    old.minimum_version = ssl.TLSVersion.TLSv1_2
+    old.maximum_version = ssl.TLSVersion.TLSv1_2
+    client = server.client(tls=old)
+    assert (await outcome_of(client)).status == "error"
+    assert "it takes TLS 1.3" in client.trouble
+
+
+async def test_a_node_cannot_stand_in_for_another(victim: Start, certificates: Path, tmp_path: Path) -> None:
+    """Whoever has taken motion's key and listens at vision's address is not taken for vision."""
+    stolen = tmp_path / "stolen"
+    shutil.copytree(certificates, stolen)
+    for end in ("pem", "key"):
+        shutil.copy(stolen / f"motion.{end}", stolen / f"vision.{end}")
+    impostor = victim(folder=str(stolen))
+    client = impostor.client(tls=context(certificates, "coordinator"))
+    assert (await outcome_of(client)).cause == "unreachable"
+    assert "its certificate is not that of vision" in client.trouble
+
+
+@pytest.mark.parametrize(
+    ("party", "role", "name", "welcome"),
+    [
+        ("coordinator", "coordinator", "coord", True),
+        ("coordinator", "client", "estop-1a2b", True),
+        ("motion", "node", "motion", True),
+        ("motion", "node", "vision", False),
+        ("motion", "coordinator", "coord", False),
+        ("motion", "client", "motion", False),
+        ("coordinator", "node", "motion", False),
+    ],
+)
+async def test_a_party_speaks_under_the_name_on_its_certificate(
+    victim: Start, certificates: Path, party: str, role: str, name: str, welcome: bool
+) -> None:
+    """A node whose key was stolen cannot give orders to the others' devices."""
+    assert may_speak_as(party, role, name) is welcome
+    server = victim(folder=str(certificates))
+    client = server.client(m.Hello(1, 1, role, name, "b1"), tls=context(certificates, party))
+    outcome = await outcome_of(client)
+    assert (outcome.status == "success") is welcome
+    if not welcome:
+        assert "certificate" in outcome.text and server.about()["faults"] == {"certificate": 1}
+
+
+def test_nobody_certified_speaks_as_nobody() -> None:
+    """Without a common name there is no role."""
+    assert not may_speak_as("", "coordinator", "coordinator") and not may_speak_as("", "node", "")
+
+
+# --- the command ------------------------------------------------------------------------------------------------------------
+
+
+def services_in(folder: Path) -> Path:
+    """Two nodes on two hosts."""
+    path = folder / "services.toml"
+    nodes = "".join(
+        f'[nodes.{name}]\nhost = "{host}"\nport = {port}\n'
+        for name, host, port in (("vision", "192.168.7.2", 7301), ("motion", "192.168.7.3", 7302))
+    )
+    path.write_text("schema = 1\n" + nodes, encoding="utf-8")
+    return path
+
+
+def test_keys_makes_certificates_and_says_where_to_copy_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One command; keys are their owner's alone; a second time it adds what is missing and overwrites nothing."""
+    monkeypatch.chdir(tmp_path)
+    services = str(services_in(tmp_path))
+    assert main(["keys", "--tls", "--services", services]) == 0
+    said = capsys.readouterr().out
+    assert "192.168.7.2: ca.pem, vision.pem, vision.key" in said and 'certificates = "keys"' in said
+    folder = tmp_path / "keys"
+    assert {path.name for path in folder.iterdir()} == {
+        f"{name}.{end}" for name in ("ca", "coordinator", "vision", "motion") for end in ("pem", "key")
+    }
+    for key in folder.glob("*.key"):
+        assert stat.S_IMODE(key.stat().st_mode) == 0o600
+        assert key.read_text().splitlines()[1] not in said
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    (folder / "motion.pem").unlink()
+    (folder / "motion.key").unlink()
+    assert main(["keys", "--tls", "--services", services]) == 0
+    for name, data in before.items():
+        assert ((folder / name).read_bytes() == data) is not name.startswith("motion")
+    context(folder, "motion")
+
+
+def test_keys_without_the_authoritys_key_says_where_to_go(tmp_path: Path) -> None:
+    """A host that only has copies cannot make more."""
+    make_certificates(tmp_path, ["coordinator"])
+    (tmp_path / "ca.key").unlink()
+    with pytest.raises(CertificateError, match="run this where the authority was made"):
+        make_certificates(tmp_path, ["vision"])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (lambda folder: (folder / "vision.key").unlink(), "petrobot keys --tls"),
+        (lambda folder: (folder / "vision.key").chmod(0o644), "chmod 600"),
+        (lambda folder: (folder / "vision.pem").write_text("no certificate"), "copy vision's files here"),
+        (
+            lambda folder: shutil.copy(folder / "motion.key", folder / "vision.key"),
+            "no certificate of vision can be used",
+        ),
+        (lambda folder: (folder / "ca.pem").unlink(), "no certificate of vision can be used"),
+    ],
+)
+def test_bad_files_give_one_clear_error(tmp_path: Path, spoil: Callable[[Path], Any], says: str) -> None:
+    """Which file, and what to do."""
+    make_certificates(tmp_path, ["vision", "motion"])
+    spoil(tmp_path)
+    with pytest.raises(KeyFileError, match=says):
+        Credentials("vision", None, tmp_path).server()
+
+
+def test_stream_keys_are_of_the_ticket(tmp_path: Path) -> None:
+    """With certificates a stream is sealed by what crossed TLS; with a shared key by that; on loopback by nothing."""
+    certified, keyed = Credentials("vision", None, tmp_path), Credentials("vision", b"k" * 32)
+    one, two = certified.stream_key("secret.1"), certified.stream_key("secret.2")
+    assert one == two and one is not None and len(one) == 32
+    assert certified.stream_key("other.1") != one and certified.stream_key("") is None
+    assert keyed.stream_key("secret.1") == b"k" * 32 and Credentials("vision").stream_key("secret.1") is None
+
+
+async def test_client_tells_why_it_is_lost(victim: Start, certificates: Path, tmp_path: Path) -> None:
+    """A coordinator whose certificate is refused hears of it, not of a cable."""
+    make_certificates(tmp_path, ["coordinator"])
+    shutil.copy(certificates / "ca.pem", tmp_path / "ca.pem")
+    server = victim(folder=str(certificates))
+    client = server.client(tls=context(tmp_path, "coordinator"))
+    client.start()
+    async with asyncio.timeout(20.0):
+        while "our certificate is not trusted" not in client.trouble:
+            await asyncio.sleep(0.005)
+    await client.close()
