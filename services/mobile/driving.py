@@ -32,6 +32,8 @@ REFLECTOR_PATIENCE: Final = 1.2
 """s that a reflector is waited for at the line's end."""
 LOOK: Final = 0.35
 """s of looking after each turn of a search."""
+STANDS_FOR: Final = 0.6
+"""s that the rover must have stood at the T: the rules ask for half a second."""
 STOP_AT: Final = 0.10
 """m beyond the T's bar where the axle comes to stand: the middle of what the rules allow."""
 
@@ -49,6 +51,7 @@ async def enable_drives(ctx: Context, *, timeout: float = 8.0, forget: bool = Fa
         return error("refused", why)
     if forget:
         await _command(ctx, {"do": "forget"})
+        await _command(ctx, {"do": "stretch"})
     if not await ctx.wait(lambda: bool(ctx.device.state["enabled"]), max(0.0, until - ctx.now)):
         return _trouble(ctx.device.state) or error("timeout", f"the drives were not enabled within {timeout} s")
     return success()
@@ -134,7 +137,7 @@ async def stop_at_t(ctx: Context, *, line_end: Sequence[float], speed: float = 0
     """Come to stand with the axle just behind the T's bar. SUCCESS when standing within 0.3 m of it; ERROR as the driver says."""
     end = Pose(*map(float, line_end))
     drive = _Drive(ctx, "feed_forward", speed, timeout)
-    stuck = await drive.start(())
+    stuck = await drive.start((), look=False)
     if stuck is None:
         await _command(ctx, {"do": "plan", "points": paths.arc(end, 0.0, STOP_AT)})
         stuck = await drive.until(lambda state: success() if _stands(state) else None, timeout)
@@ -142,6 +145,7 @@ async def stop_at_t(ctx: Context, *, line_end: Sequence[float], speed: float = 0
     if stuck.cause:
         return stuck
     await ctx.wait(lambda: bool(ctx.device.state["standing"]), 2.0)
+    await ctx.sleep(STANDS_FOR)
     x, y, _ = ctx.device.state["pose"]
     ahead, aside = end.body(x, y)
     if not (-0.1 < ahead < 0.3 and abs(aside) < 0.3):
@@ -222,7 +226,7 @@ async def _go(drive: _Drive, to: Pose, rate: float) -> Result | None:
         if ended is not None:
             return ended
         x, y, _ = ctx.device.state["pose"]
-        await _command(ctx, {"do": "forget", "seen": not ctx.device.state["sights"]})
+        await _command(ctx, {"do": "forget"})  # the way leads off the line: what was seen of it would pull the rover back
     await _command(ctx, {"do": "plan", "points": [(x, y), *paths.straight((x, y), (to.x, to.y))]})
 
     def judge(state: Mapping[str, Any]) -> Result | None:
@@ -275,9 +279,9 @@ class _Drive:
         """s that the run may still take."""
         return max(0.0, self._until - self.ctx.now)
 
-    async def start(self, gates: Sequence[Pose]) -> Result | None:
+    async def start(self, gates: Sequence[Pose], *, look: bool = True) -> Result | None:
         """Begin a new stretch that leads through one of the gates; how the run ends if the driver refuses."""
-        why = await _command(self.ctx, {"do": "stretch", "gates": [tuple(gate) for gate in gates]})
+        why = await _command(self.ctx, {"do": "stretch", "gates": [tuple(gate) for gate in gates], "look": look})
         return error("refused", why) if why else None
 
     async def rest(self) -> None:

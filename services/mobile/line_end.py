@@ -1,41 +1,34 @@
-"""How the line ends: at the edge of a square without a track, or in the crossbar of the T.
+"""How the line ends: at the edge of a square that carries no track, or in the crossbar of the T.
 
-The crossbar has the colour of the square behind it, so it is no stripe of its own: it pushes the edge of the square 5 cm
-towards the rover as far as the bar reaches. What is measured is the place of that edge beside the line, close to it (where a
-bar would be) and farther out (where there is none): one straight edge, an interruption; an edge that steps by a bar's width, the T.
-The colours do not matter, nor does a small error in the direction of the line: the edge may be askew.
+Both are looked for in a patch of floor around the line's last point, in columns beside the line: a crossbar is a stripe
+across it with the square's colour on both sides, the edge of a square a step in one straight line, farther out than a bar
+reaches. The colours do not matter, nor does a small error in the direction of the line: stripe and edge may be askew.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.mobile.floor import FloorView
+from services.mobile.floor import FloorView, Grey
 from services.mobile.model import Track
 from services.mobile.sight import End, Sight, TrackEnd, Vector, polynomial
 
 BACK, ON, STEP = 0.16, 0.26, 0.01
-"""m before and after the last point of the line that are searched for the square's edge, and the step."""
+"""m before and after the last point of the line that are searched, and the step."""
+AT_LEAST, AT_MOST = -0.06, 0.20
+"""m from the line's last point to its end: rows are centimetres apart, and the last ones may have been missed."""
 SURE = 0.012
-"""m, root mean square, that the edge may be off the better of the two shapes, and less than `BETTER` of the other's."""
-BETTER = 0.6
+"""m, root mean square, that a stripe or an edge may be off a straight line."""
 ASKEW = 0.45
-"""Slope of the edge against the square to the line's direction."""
+"""Slope of stripe or edge against the square to the line's direction."""
 LEAST_CONTRAST = 14.0
+CONTRAST_SHARE = 0.3
+"""Share of the patch's range of grey that an edge or a stripe must have."""
 NEEDED = 3
-"""Edges that must be seen both near the line and farther out."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Columns:
-    """Places beside the line (m, to the left positive) at which the edge is looked for."""
-
-    inner: Vector
-    outer: Vector
+"""Columns on each side of the line that must show the stripe; edges that must be seen near the line and farther out."""
 
 
 class EndFinder:
@@ -47,63 +40,83 @@ class EndFinder:
         half, line = 0.5 * track.bar_length, 0.5 * track.width
         inner = np.linspace(line + 0.045, half - 0.03, 6)
         outer = np.linspace(half + 0.035, half + 0.17, 6)
-        self._columns = _Columns(np.concatenate([-inner, inner]), np.concatenate([-outer, outer]))
+        self._aside = np.concatenate([-inner, inner, -outer, outer])
+        self._inner = np.arange(self._aside.size) < 2 * inner.size
         self._s = np.arange(-BACK, ON + 1e-9, STEP)
 
     def judge(self, image: NDArray[np.uint8], sight: Sight) -> End | None:
-        """How a line that broke off ends; None when too little of the square's edge is in view or it is neither."""
+        """How a line that broke off ends; None when it is neither, or too little is in view to tell."""
         if not (sight.seen and sight.broke_off):
             return None
         x, y, direction = _last(sight)
-        columns = self._columns
-        aside = np.concatenate([columns.inner, columns.outer])
-        edge = self._edges(image, x, y, direction, aside)
-        found = ~np.isnan(edge)
-        inner = np.arange(aside.size) < columns.inner.size
-        if int((found & inner).sum()) < NEEDED or int((found & ~inner).sum()) < NEEDED:
+        grey = self._patch(image, x, y, direction)
+        valid = ~np.isnan(grey).any(axis=1)
+        if int(valid.sum()) < 2 * NEEDED:
             return None
-        kind, at = self._shape(aside[found], edge[found], inner[found])
-        if kind is TrackEnd.NONE or not -0.06 < at < 0.24:
-            return None  # not where the line ends: rows are centimetres apart, and the last ones may have been missed
+        least = max(LEAST_CONTRAST, CONTRAST_SHARE * float(grey[valid].max() - grey[valid].min()))
+        bar, striped = self._stripe(grey, valid, least)
+        if bar is not None:
+            kind, at = TrackEnd.T, bar + 0.5 * self._bar
+        elif striped:
+            return None
+        else:
+            edge = self._edge(grey, valid, least)
+            if edge is None:
+                return None
+            kind, at = TrackEnd.INTERRUPTION, edge
         return End(kind, x + at * math.cos(direction), y + at * math.sin(direction))
 
-    def _shape(self, aside: Vector, edge: Vector, inner: NDArray[np.bool_]) -> tuple[TrackEnd, float]:
-        """Which shape the edge has, and where (m from the line's last point) the square ends on the line."""
-        plain, plain_off = _straight(aside, edge)
-        barred, barred_off = _straight(aside, edge + self._bar * inner)
-        if plain_off < SURE and plain_off < BETTER * barred_off and abs(plain[1]) < ASKEW:
-            return TrackEnd.INTERRUPTION, plain[0]
-        if barred_off < SURE and barred_off < BETTER * plain_off and abs(barred[1]) < ASKEW:
-            return TrackEnd.T, barred[0]
-        return TrackEnd.NONE, 0.0
-
-    def _edges(
-        self, image: NDArray[np.uint8], x: float, y: float, direction: float, aside: Vector
-    ) -> Vector:
-        """Where along the line's direction (m from its last point) each column crosses from one colour to the other, else NaN."""
+    def _patch(self, image: NDArray[np.uint8], x: float, y: float, direction: float) -> Grey:
+        """Grey levels (columns beside the line, places along its direction)."""
         cos, sin = math.cos(direction), math.sin(direction)
-        s, t = self._s[None, :], aside[:, None]
-        grey = self._view.sample(image, x + s * cos - t * sin, y + s * sin + t * cos)
-        rise = grey[:, 3:] - grey[:, :-3]
-        size = np.abs(rise)
-        valid = ~np.isnan(size).any(axis=1)
-        size = np.where(np.isnan(size), 0.0, size)
-        best = np.clip(size.argmax(axis=1), 1, size.shape[1] - 2)
-        row = np.arange(size.shape[0])
-        before, at, after = size[row, best - 1], size[row, best], size[row, best + 1]
-        valid &= at > max(LEAST_CONTRAST, 0.3 * float(np.nanmax(grey) - np.nanmin(grey)) if valid.any() else 255.0)
-        shift = 0.5 * (before - after) / np.minimum(before - 2.0 * at + after, -1e-6)
-        places = self._s[0] + (best + 1.5 + shift) * STEP
-        return np.where(valid, places, np.nan)
+        s, t = self._s[None, :], self._aside[:, None]
+        return self._view.sample(image, x + s * cos - t * sin, y + s * sin + t * cos)
+
+    def _stripe(self, grey: Grey, valid: NDArray[np.bool_], least: float) -> tuple[float | None, bool]:
+        """Where a crossbar's middle meets the line (m from its last point), None if there is none; and whether much looks like one."""
+        side = round(self._bar / STEP)
+        core = (grey[:, :-2] + grey[:, 1:-1] + grey[:, 2:]) / np.float32(3.0)
+        left, right = core[:, side:-side] - core[:, : -2 * side], core[:, side:-side] - core[:, 2 * side :]
+        lesser = np.minimum(np.abs(left), np.abs(right))
+        size = np.where((left * right > 0.0) & valid[:, None], lesser, np.float32(0.0))
+        best, place = _peaks(size, self._s[0] + (1 + side) * STEP)
+        shows = (best > least) & valid & self._inner
+        left_side, right_side = shows & (self._aside < 0.0), shows & (self._aside > 0.0)
+        striped = int(shows.sum()) >= NEEDED
+        if int(left_side.sum()) < NEEDED or int(right_side.sum()) < NEEDED:
+            return None, striped
+        line, off = _straight(self._aside[shows], place[shows])
+        fits = off < SURE and abs(line[1]) < ASKEW and AT_LEAST < line[0] < AT_MOST
+        return (line[0] if fits else None), striped
+
+    def _edge(self, grey: Grey, valid: NDArray[np.bool_], least: float) -> float | None:
+        """Where the edge of the square meets the line (m from its last point), None if there is none."""
+        size = np.where(valid[:, None], np.abs(grey[:, 3:] - grey[:, :-3]), np.float32(0.0))
+        best, place = _peaks(size, self._s[0] + 1.5 * STEP)
+        shows = (best > least) & valid
+        if int((shows & self._inner).sum()) < NEEDED or int((shows & ~self._inner).sum()) < NEEDED:
+            return None
+        line, off = _straight(self._aside[shows], place[shows])
+        fits = off < SURE and abs(line[1]) < ASKEW and AT_LEAST < line[0] < AT_MOST
+        return line[0] if fits else None
 
 
-def _straight(aside: Vector, edge: Vector) -> tuple[list[float], float]:
-    """The straight line through an edge but for its worst point (at 0 and slope), and how far the rest is off it (m, rms)."""
-    line = polynomial(aside, edge, 1)
-    off = np.abs(edge - line[0] - line[1] * aside)
-    keep = np.arange(edge.size) != int(off.argmax())
-    line = polynomial(aside[keep], edge[keep], 1)
-    off = edge[keep] - line[0] - line[1] * aside[keep]
+def _peaks(size: Grey, first: float) -> tuple[Grey, Vector]:
+    """Each row's greatest value and its place (m), to a fraction of a step; column 0 lies at `first` (m)."""
+    row = np.arange(size.shape[0])
+    best = np.clip(size.argmax(axis=1), 1, size.shape[1] - 2)
+    before, at, after = size[row, best - 1], size[row, best], size[row, best + 1]
+    shift = 0.5 * (before - after) / np.minimum(before - 2.0 * at + after, -1e-6)
+    return at, first + (best + np.clip(shift, -1.0, 1.0)) * STEP
+
+
+def _straight(aside: Vector, place: Vector) -> tuple[list[float], float]:
+    """The straight line through points but for the worst one (at 0 and slope), and how far the rest is off it (m, rms)."""
+    line = polynomial(aside, place, 1)
+    off = np.abs(place - line[0] - line[1] * aside)
+    keep = np.arange(place.size) != int(off.argmax())
+    line = polynomial(aside[keep], place[keep], 1)
+    off = place[keep] - line[0] - line[1] * aside[keep]
     return line, math.sqrt(float(off @ off) / off.size)
 
 
@@ -115,5 +128,5 @@ def _last(sight: Sight) -> tuple[float, float, float]:
     if px.size < 3:
         px, py = x - x[-1], y
     degree = 2 if px.size >= 6 else 1
-    coefficients = np.polynomial.polynomial.polyfit(px, py, degree)
+    coefficients = polynomial(px, py, degree)
     return float(x[-1]), float(coefficients[0]), math.atan(float(coefficients[1]))

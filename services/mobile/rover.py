@@ -28,6 +28,8 @@ LEASE: Final = 0.4
 STANDING: Final = 0.004
 """m/s below which the rover counts as standing."""
 STREAM: Final = "track_ahead"
+AT_END: Final = 0.04
+"""m before the end of all that is known at which there is no line any more."""
 TURN_GAIN: Final = 3.0
 """1/s: turning speed for each radian that is left."""
 TURNED: Final = 0.02
@@ -188,12 +190,11 @@ class Rover:
         gates = body.get("gates", ())
         if any(len(gate) != 3 or not all(math.isfinite(c) for c in gate) for gate in gates):
             raise ValueError("stretch: gates are poses of three finite numbers (m, m, rad, odometry frame)")
-        self._map.begin([Pose(*map(float, gate)) for gate in gates])
+        self._map.begin([Pose(*map(float, gate)) for gate in gates], look=bool(body.get("look", True)))
 
     def _forget(self, body: Mapping[str, Any]) -> None:
         if body.get("seen", True):
             self._map.drop_seen()
-            self._map.begin()
         if body.get("plan", True):
             self._map.drop_plan()
 
@@ -266,24 +267,20 @@ class Rover:
         return self._turn_on() if self._mode == "turn" else self._follow_on()
 
     def _follow_on(self) -> tuple[float, float]:
-        if self._setpoint.values is None and not self._end_is_known():
+        if self._setpoint.values is None and not self._map.complete:
             self._reason = "stale"
             return self._brake()
         curvature = LAWS[self._law].curvature(self._fit, self._speed)
         if curvature is None:
             curvature = LAWS["pursuit"].curvature(self._fit, self._speed)
         ahead = self._map.ahead(self._odometry.pose)
-        if curvature is None or ahead <= 0.0:
+        if curvature is None or ahead <= AT_END:
             self._reason = "no_line"
             return self._brake()
         self._reason = ""
         wanted = self._profile.speed(self._asked, curvature, ahead)
         self._speed = self._profile.towards(self._speed, wanted, self.numbers.bus.period)
         return self._set_wheels(self._speed, self._speed * curvature)
-
-    def _end_is_known(self) -> bool:
-        """Whether the track is known to its end, so that nothing needs to be seen any more until there."""
-        return self._map.end is not None
 
     def _turn_on(self) -> tuple[float, float]:
         if abs(self._speed) > 0.01:

@@ -24,8 +24,10 @@ Vector = NDArray[np.float64]
 CAPACITY = 1000
 """Points kept; the oldest go."""
 STEP = 0.015
-"""m or, turning, about as many degrees between two sights that are taken: a standing rover learns nothing new."""
+"""m or, turning, about as many degrees between two places from which sights are taken."""
 TURN_STEP = 0.03
+ALIKE = 5
+"""Sights that are taken from one place: a standing rover's noise is averaged, then it learns nothing new."""
 REACH = 0.26
 """m around a place within which points bear on the fit there, the nearer the more."""
 NEEDED = 4
@@ -64,6 +66,7 @@ class TrackMap:
         self._points = np.zeros((CAPACITY, 3))
         self._count = 0
         self._taken_at: Pose | None = None
+        self._alike = 0
         self._planned: Vector = np.empty((0, 3))
         self._ends: deque[tuple[TrackEnd, float, float]] = deque(maxlen=ENDS)
         self.tip: tuple[float, float] | None = None
@@ -75,25 +78,32 @@ class TrackMap:
         self.nearest_fresh: tuple[float, float] | None = None
         """The nearest point of the newest of them."""
         self._gates: tuple[Pose, ...] = ()
+        self._looks = True
 
     def clear(self) -> None:
         """Forget everything."""
         self.__init__()  # type: ignore[misc]
 
-    def begin(self, gates: Sequence[Pose] = ()) -> None:
+    def begin(self, gates: Sequence[Pose] = (), *, look: bool = True) -> None:
         """A new stretch begins: what lies behind stays for the axle to pass over, the end of the last one is forgotten.
 
-        With `gates` only a line that leads through one of them is taken for it: others may be in view.
+        With `gates` only a line that leads through one of them is taken for it: others may be in view. Without `look`
+        no sight is taken until the next stretch begins.
         """
         self._ends.clear()
         self.sights, self.refused, self.nearest_fresh = 0, 0, None
-        self._gates = tuple(gates)
+        self._gates, self._looks = tuple(gates), look
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing needs to be seen any more: the end is known, or no sights are taken at all."""
+        return not self._looks or bool(self._ends)
 
     # Taking in
 
     def take(self, pose: Pose, ahead: TrackAhead) -> bool:
         """A sight from `pose` (where the rover was at exposure). False if it was not taken: nothing new, or something else."""
-        if len(ahead.points) < 3:
+        if len(ahead.points) < 3 or not self._looks:
             return False
         if not self._admitted(pose, ahead.points) or self._contradicts(pose, ahead.points):
             self.refused += 1
@@ -135,7 +145,9 @@ class TrackMap:
         last = self._taken_at
         if last is None:
             return False
-        return math.hypot(pose.x - last.x, pose.y - last.y) < STEP and abs(pose.heading - last.heading) < TURN_STEP
+        here = math.hypot(pose.x - last.x, pose.y - last.y) < STEP and abs(pose.heading - last.heading) < TURN_STEP
+        self._alike = self._alike + 1 if here else 0
+        return self._alike >= ALIKE
 
     def _admitted(self, pose: Pose, points: Sequence[tuple[float, float]]) -> bool:
         """Whether a line may be the new stretch: gates are asked until it has been seen."""

@@ -32,7 +32,7 @@ class Pose:
 class Floor:
     """Elements ("S", "L", "R"; lower case: unpainted) from (0, 0) along x; squares of 2 m with their first edge there.
 
-    `inverted` swaps black and white; `bar` paints a T at the end.
+    `inverted` swaps black and white; `bar` ends the last element, a straight one, in a T 0.25 m before its square's edge.
     """
 
     def __init__(self, elements: str, *, inverted: bool = False, bar: bool = False, width: float = 0.05) -> None:
@@ -44,6 +44,7 @@ class Floor:
             self.elements.append((letter, pose))
             pose = pose.moved(2.0) if turn == 0 else pose.moved(1.0, float(turn), turn * math.pi / 2)
         self.end = pose
+        self.t = pose.moved(-0.25)
 
     def at(self, s: float, aside: float = 0.0, turn: float = 0.0) -> Pose:
         """The pose `s` metres along the centre line, `aside` m to its left, turned by `turn` rad."""
@@ -71,7 +72,8 @@ class Floor:
             off = np.abs(w) if bend == 0 else np.abs(np.hypot(u, 1.0 - bend * w) - 1.0)
             marked |= inside & (off <= 0.5 * self.width)
         if self.bar:
-            u, w = _body(self.end, x, y)
+            u, w = _body(self.t, x, y)
+            marked &= ~((u > 0.0) & (u < 0.25) & (np.abs(w) < 0.1))
             marked |= (u <= 0.0) & (u >= -0.05) & (np.abs(w) <= 0.25)
         result: NDArray[np.bool_] = colour ^ marked
         return result
