@@ -21,11 +21,12 @@ from sim.rover_drives import RoverBus
 from sim.rover_sensor import Echo, ReflectorSensor, look
 from sim.track import Track
 from sim.track_camera import FloorCamera, Motion
+from sim.track_elements import Pose
 from sim.track_faults import read_rover_fault
 from sim.track_floor import Floor, Picture
 from sim.track_light import Hall
 from sim.track_referee import Referee
-from sim.track_truth import TrackSite, TrackTruth, track_site_of
+from sim.track_truth import RoverTruth, TrackSite, TrackTruth, track_site_of
 
 REGIME: Final = "straight"
 """The regime if none is asked for."""
@@ -72,7 +73,8 @@ class TrackLaboratory(LaboratoryParty):
         self.bus.power(True)
         self.bus.sensor.dead = False
         self.rover.move_to(self.now)
-        self.rover.place(truth.rover, track.start, np.random.default_rng((seed, _SLIP)))
+        draws = np.random.default_rng((seed, _SLIP))
+        self.rover.place(truth.rover, _put_down(track.start, truth.rover, draws), draws)
         self.referee = Referee(track, seed, truth.regime, self.now)
         self._watch_due = self.now
 
@@ -172,6 +174,13 @@ class TrackLaboratory(LaboratoryParty):
 
     def close(self) -> None:
         """Nothing is held outside of memory."""
+
+
+def _put_down(start: Pose, rover: RoverTruth, draws: np.random.Generator) -> Pose:
+    """Where a hand puts the rover that is to stand at `start`."""
+    dx, dy, turn = draws.standard_normal(3).tolist()
+    aside, heading = rover.settings["placed"], rover.settings["placed_heading"]
+    return Pose(start.x + aside * dx, start.y + aside * dy, start.heading + heading * turn)
 
 
 _WATCH: Final = 0.02

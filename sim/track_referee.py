@@ -28,7 +28,7 @@ STANDING: Final = 0.01
 STANDING_FOR: Final = 0.5
 """... for so many seconds."""
 DEPARTED: Final = 0.01
-"""m from the start at which the clock starts."""
+"""m from where it was put down at which the clock starts."""
 ROW_PERIOD: Final = 0.2
 """s between two rows of the path."""
 _BEHIND, _AHEAD = 0.6, 1.2
@@ -78,6 +78,7 @@ class Referee:
     _off: float = 0.0
     _squares: float = 0.0
     _most: float = 0.0
+    _first: Pose | None = None
     _last: Pose | None = None
     _still_since: float | None = None
     _crossings: list[_Crossing] = field(default_factory=list)
@@ -92,11 +93,12 @@ class Referee:
             self._path.append((now - self.began, *pose))
         if self.stopped is not None:
             return
+        if self._first is None:
+            self._first = pose
         last, self._last = self._last, pose
         step = 0.0 if last is None else math.hypot(pose.x - last.x, pose.y - last.y)
         if self.departed is None:
-            start = self.track.start
-            if math.hypot(pose.x - start.x, pose.y - start.y) < DEPARTED:
+            if math.hypot(pose.x - self._first.x, pose.y - self._first.y) < DEPARTED:
                 return
             self.departed = now
         self._way += step

@@ -48,7 +48,7 @@ class RoverTruth:
     battery: tuple[float, float, float]
     """Voltage at the start (V), its fall (V/s), resistance (ohm)."""
     settings: Mapping[str, float]
-    """Friction, inertia, brakes, torque, electronics."""
+    """How it is put down, friction, inertia, brakes, torque, electronics."""
 
 
 @dataclass(frozen=True, slots=True)

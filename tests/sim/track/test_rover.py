@@ -15,7 +15,15 @@ from sim.rover import Rover
 from sim.track_elements import Pose
 from sim.track_truth import RoverTruth, TrackSite, WheelTruth
 
-SETTINGS = {"brake_lag": 0.02, "friction": 1.2, "inertia": 0.12, "rated_torque": 8.0, "electronics": 30.0}
+SETTINGS = {
+    "placed": 0.0,
+    "placed_heading": 0.0,
+    "brake_lag": 0.02,
+    "friction": 1.2,
+    "inertia": 0.12,
+    "rated_torque": 8.0,
+    "electronics": 30.0,
+}
 IDEAL = RoverTruth(
     wheels=(WheelTruth(0.1, 0.06), WheelTruth(0.1, 0.06)),
     track_width=0.4,
