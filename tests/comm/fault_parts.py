@@ -1,0 +1,158 @@
+"""Other processes that are killed, frozen or cut off: a node, a sender of set points, and the cable between.
+
+python -m tests.comm.fault_parts node            # prints its port
+python -m tests.comm.fault_parts sender PORT PERIOD
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import Enum
+from pathlib import Path
+
+from services.comm.callee import Callee, CancelRun, Offer, Order
+from services.comm.server import Server
+from services.comm.stream import StreamSender
+
+HOST = "127.0.0.1"
+ROOT = Path(__file__).parents[2]
+STREAM = "points"
+
+
+class Fault(Enum):
+    """What befalls the other side."""
+
+    KILLED = "killed"
+    FROZEN = "frozen"
+    CUT = "cut off"
+    """Its cable is cut: no byte comes through, and no word that the connection is over."""
+
+
+class Cable:
+    """Carries bytes between who connects to `port` and the other end, until it is cut."""
+
+    def __init__(self, far: int) -> None:
+        self._far = far
+        self._listener = socket.create_server((HOST, 0))
+        self.port = int(self._listener.getsockname()[1])
+        self._wake, self._stop = socket.socketpair()
+        self._cut = False
+        self._thread = threading.Thread(target=self._carry)
+        self._thread.start()
+
+    def cut(self) -> None:
+        """From now on nothing comes through, and both ends stay open."""
+        self._cut = True
+        self._wake.send(b"x")
+
+    def close(self) -> None:
+        """Let all ends go."""
+        self._wake.close()
+        self._thread.join()
+
+    def _carry(self) -> None:
+        pairs: dict[socket.socket, socket.socket] = {}
+        while True:
+            waiting = [self._stop] if self._cut else [self._stop, self._listener, *pairs]
+            ready, _, _ = select.select(waiting, [], [])
+            if self._stop in ready and not self._stop.recv(16):
+                break
+            for one in [] if self._cut else [one for one in ready if one is not self._stop]:
+                if one is self._listener:
+                    self._join(pairs)
+                elif one in pairs:
+                    self._pass_on(one, pairs)
+        for one in (*pairs, self._listener, self._stop):
+            one.close()
+
+    def _join(self, pairs: dict[socket.socket, socket.socket]) -> None:
+        near, _ = self._listener.accept()
+        try:
+            far = socket.create_connection((HOST, self._far))
+        except OSError:
+            near.close()  # nobody is there any more
+        else:
+            pairs |= {near: far, far: near}
+
+    @staticmethod
+    def _pass_on(one: socket.socket, pairs: dict[socket.socket, socket.socket]) -> None:
+        data = b""
+        with contextlib.suppress(OSError):
+            data = one.recv(1 << 16)
+        other = pairs[one]
+        with contextlib.suppress(OSError):
+            other.sendall(data)
+        if not data:
+            for end in (one, other):
+                del pairs[end]
+                end.close()
+
+
+def inflict(fault: Fault, process: subprocess.Popen[str], cable: Cable) -> None:
+    """Let it befall the process, or the cable to it."""
+    if fault is Fault.CUT:
+        cable.cut()
+    else:
+        process.send_signal(signal.SIGKILL if fault is Fault.KILLED else signal.SIGSTOP)
+
+
+@contextmanager
+def part(*arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """One of the processes below, ended at the end whatever befell it."""
+    command = [sys.executable, "-m", "tests.comm.fault_parts", *arguments]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def first_line(process: subprocess.Popen[str]) -> str:
+    """The first thing that it says."""
+    assert process.stdout is not None
+    return process.stdout.readline().strip()
+
+
+async def be_node() -> None:
+    """A node whose action `move` goes on until it is cancelled."""
+
+    def obey(now: float, orders: list[Order]) -> None:
+        for order in orders:
+            if isinstance(order, CancelRun):
+                callee.finish(now, order.id, "error", cause="cancelled", text="it was told to stop")
+
+    callee = Callee("motion", "n1", {"move": Offer()})
+    server = Server(callee, on_orders=obey)
+    await server.start(HOST, 0)
+    print(server.address[1], flush=True)
+    await asyncio.Event().wait()
+
+
+def be_sender(port: int, period: float) -> None:
+    """Sends one set point a period by absolute deadline, and stands by it: the number of periods since the beginning."""
+    sender = StreamSender("vision", STREAM, period, HOST, port)
+    due, number = time.monotonic(), 0
+    while True:
+        number += 1
+        due += period
+        while (wait := due - time.monotonic()) > 0.0:
+            select.select([], [], [], wait)
+        sender.send((float(number),))
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "node":
+        asyncio.run(be_node())
+    else:
+        be_sender(int(sys.argv[2]), float(sys.argv[3]))

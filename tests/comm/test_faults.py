@@ -1,0 +1,149 @@
+"""Real processes killed (kill -9), frozen (SIGSTOP) and cut off: what is known of them, in which order, and what holds.
+
+How long it takes stands in tests/bench/faults.py; here is what must be so however busy the machine is.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import select
+import signal
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import pytest
+
+from services.comm import messages as m
+from services.comm.caller import Accepted, Caller, Ended, Late, Notice, PeerBack, PeerLost
+from services.comm.client import Client
+from services.comm.messages import Executed
+from services.comm.stream import STALE_AFTER, Incoming, StreamReceiver
+
+from .fault_parts import HOST, STREAM, Cable, Fault, first_line, inflict, part
+
+pytestmark = pytest.mark.processes
+LIMIT = 20.0
+
+
+class Told:
+    """A coordinator's client and all that it was told, in order."""
+
+    def __init__(self, port: int) -> None:
+        self.notices: list[Notice] = []
+        self.changed = asyncio.Event()
+        self.caller = Caller("motion", m.Hello(1, 1, "coordinator", "coord", "c1", 1))
+        self.client = Client(HOST, port, self.caller, on_notices=self._take)
+        self.client.start()
+
+    def _take(self, now: float, notices: list[Notice]) -> None:
+        self.notices += notices
+        self.changed.set()
+
+    async def until(self, kind: type[Any], number: int = 1) -> Any:
+        """The so-manieth notice of a kind."""
+        async with asyncio.timeout(LIMIT):
+            while len(found := [one for one in self.notices if isinstance(one, kind)]) < number:
+                self.changed.clear()
+                await self.changed.wait()
+        return found[number - 1]
+
+    def order(self) -> list[str]:
+        """The kinds of all notices, in order."""
+        return [type(one).__name__ for one in self.notices]
+
+    async def begin(self) -> None:
+        """A run that goes on at the node."""
+        assert await self.client.connected(LIMIT)
+        self.caller.call(self.client.now(), m.Call("1", "move"))
+        self.client.flush()
+        await self.until(Accepted)
+
+
+@pytest.mark.parametrize(
+    ("fault", "says"),
+    [(Fault.KILLED, ("hung up", "broke")), (Fault.FROZEN, ("silent",)), (Fault.CUT, ("silent",))],
+    ids=lambda one: one.value if isinstance(one, Fault) else "",
+)
+async def test_a_node_that_is_lost_is_named_and_its_run_ends_once_with_unknown(
+    fault: Fault, says: tuple[str, ...]
+) -> None:
+    with part("node") as process:
+        cable = Cable(int(await asyncio.to_thread(first_line, process)))
+        told = Told(cable.port)
+        await told.begin()
+        inflict(fault, process, cable)
+        lost = await told.until(PeerLost)
+        assert any(one in lost.reason for one in says), lost.reason
+        ended = (await told.until(Ended)).outcome
+        assert (ended.status, ended.cause, ended.executed) == ("error", "lost", Executed.UNKNOWN)
+        assert told.order() == ["PeerBack", "Accepted", "PeerLost", "Ended"]
+        await told.client.close()
+        cable.close()
+
+
+async def test_a_node_that_thaws_is_back_and_stops_the_run_that_was_given_up() -> None:
+    with part("node") as process:
+        told = Told(int(await asyncio.to_thread(first_line, process)))
+        await told.begin()
+        process.send_signal(signal.SIGSTOP)
+        await told.until(Ended)
+        process.send_signal(signal.SIGCONT)
+        back = await told.until(PeerBack, 2)
+        assert back.same_boot and back.runs == ("1",), "it never noticed, and the run goes on"
+        late = (await told.until(Late)).outcome
+        assert (late.id, late.cause, late.executed) == ("1", "cancelled", Executed.YES), "recorded, and moves nothing"
+        assert told.order().count("Ended") == 1
+        await told.client.close()
+
+
+class Watch:
+    """A sink that notes when values came and when they were withdrawn, on the receiver's clock (s)."""
+
+    def __init__(self) -> None:
+        self.arrived: list[float] = []
+        self.withdrawn: list[float] = []
+        self.now = 0.0
+
+    def take(self, values: Sequence[float], held: float = 0.0) -> None:
+        self.arrived.append(self.now)
+
+    def withdraw(self) -> None:
+        self.withdrawn.append(self.now)
+
+    @property
+    def valid(self) -> bool:
+        """Whether the last value counts."""
+        return bool(self.arrived) and (not self.withdrawn or self.arrived[-1] > self.withdrawn[-1])
+
+
+def poll_until(receiver: StreamReceiver, watch: Watch, holds: Callable[[], bool], period: float) -> None:
+    """Poll as a servo loop does. At no poll may a value count that came longer ago than three periods."""
+    end = time.monotonic() + LIMIT
+    while not holds():
+        select.select([], [], [], period / 10)
+        watch.now = time.monotonic()
+        receiver.poll()
+        assert not watch.valid or watch.now - watch.arrived[-1] <= STALE_AFTER * period, "too old, and it still counts"
+        assert watch.now < end, "it did not come to pass"
+
+
+@pytest.mark.parametrize("fault", Fault, ids=lambda one: one.value)
+@pytest.mark.parametrize("period", [0.004, 0.04])
+def test_no_set_point_older_than_three_periods_counts_when_its_sender_is_lost(fault: Fault, period: float) -> None:
+    watch = Watch()
+    receiver = StreamReceiver("motion", {STREAM: Incoming(period, watch)}, clock=lambda: watch.now)
+    cable = Cable(receiver.address[1])
+    with part("sender", str(cable.port), str(period)) as process:
+        poll_until(receiver, watch, lambda: len(watch.arrived) >= 20 and watch.valid, period)
+        inflict(fault, process, cable)
+        poll_until(receiver, watch, lambda: not watch.valid, period)
+        last = len(watch.arrived)
+        ends = watch.now + 10 * period
+        poll_until(receiver, watch, lambda: watch.now > ends, period)
+        assert not watch.valid, "and it stays so"
+        if fault is Fault.FROZEN:
+            process.send_signal(signal.SIGCONT)
+            poll_until(receiver, watch, lambda: len(watch.arrived) > last and watch.valid, period)
+    cable.close()
+    receiver.close()
