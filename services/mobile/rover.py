@@ -328,9 +328,9 @@ class Rover:
         return (*self._viewed_from.floor(*near), *self._viewed_from.floor(*far))
 
     def _line_end(self) -> tuple[float, float, float] | None:
-        """Pose of the line where it is known to end, or as far as it is known at all."""
+        """Pose of the line where it is known to end; at rest, as far as it is known at all."""
         place = self._map.end_place
-        if place is None:
+        if place is None or not (self._map.complete or self._reason):
             return None
         pose = self._odometry.pose
         x, y = pose.body(*place)
@@ -340,7 +340,7 @@ class Rover:
     def _regained(self) -> bool:
         """Whether a new stretch has been seen often and lies well before the rover."""
         near = self._map.nearest_fresh
-        if self._map.sights < REGAINED_SIGHTS or near is None:
+        if not self._map.gated or self._map.sights < REGAINED_SIGHTS or near is None:
             return False
         x, y = self._odometry.pose.body(*near)
         fit = self._map.fit(self._odometry.pose, max(0.2, x + 0.1))

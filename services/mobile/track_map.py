@@ -30,7 +30,7 @@ ALIKE = 5
 """Sights that are taken from one place: a standing rover's noise is averaged, then it learns nothing new."""
 REACH = 0.26
 """m around a place within which points bear on the fit there, the nearer the more."""
-NEEDED = 4
+NEEDED = 3
 """Points that a fit needs."""
 OTHER = 0.15
 """m off what is known from which a sight is of something else."""
@@ -77,6 +77,7 @@ class TrackMap:
         """Sights taken since `begin`."""
         self.nearest_fresh: tuple[float, float] | None = None
         """The nearest point of the newest of them."""
+        self._local: tuple[Pose, tuple[Vector, Vector, Vector, int]] | None = None
         self._gates: tuple[Pose, ...] = ()
         self._looks = True
 
@@ -93,6 +94,11 @@ class TrackMap:
         self._ends.clear()
         self.sights, self.refused, self.nearest_fresh = 0, 0, None
         self._gates, self._looks = tuple(gates), look
+
+    @property
+    def gated(self) -> bool:
+        """Whether the stretch is looked for through gates."""
+        return bool(self._gates)
 
     @property
     def complete(self) -> bool:
@@ -118,12 +124,14 @@ class TrackMap:
             return False
         self._taken_at = pose
         self.sights += 1
+        self._local = None
         for x, y in ahead.points:
             self._add(*pose.floor(x, y), 1.0 / (0.3 + x * x))  # near points are seen more sharply
         return True
 
     def plan(self, points: Sequence[Sequence[float]]) -> None:
         """Expect the track at these points (m), near to far, instead of those expected before."""
+        self._local = None
         self._planned = np.array([[x, y, 1.0] for x, y in points], dtype=float).reshape(-1, 3)
         self._ends.clear()
         if len(self._planned):
@@ -131,11 +139,11 @@ class TrackMap:
 
     def drop_seen(self) -> None:
         """Forget what was seen, not what is expected."""
-        self._count, self._taken_at = 0, None
+        self._count, self._taken_at, self._local = 0, None, None
 
     def drop_plan(self) -> None:
         """Expect nothing more; what was seen stays."""
-        self._planned = np.empty((0, 3))
+        self._planned, self._local = np.empty((0, 3)), None
 
     def _add(self, x: float, y: float, weight: float) -> None:
         self._points[self._count % CAPACITY] = (x, y, weight)
@@ -159,6 +167,7 @@ class TrackMap:
     def _see_instead_of_plan(self, pose: Pose, points: Sequence[tuple[float, float]]) -> None:
         """What was planned for where the line is now seen is planned no more."""
         if len(self._planned):
+            self._local = None
             cos, sin = math.cos(pose.heading), math.sin(pose.heading)
             x = (self._planned[:, 0] - pose.x) * cos + (self._planned[:, 1] - pose.y) * sin
             y = (self._planned[:, 1] - pose.y) * cos - (self._planned[:, 0] - pose.x) * sin
@@ -166,7 +175,7 @@ class TrackMap:
 
     def _contradicts(self, pose: Pose, points: Sequence[tuple[float, float]]) -> bool:
         off = []
-        for x, y in points:
+        for x, y in points[:: max(1, len(points) // 4)]:
             fit = self.fit(pose, x, 0.12, planned=False)
             if fit is not None:
                 off.append(abs(fit.y - y) * math.cos(fit.heading))
@@ -214,21 +223,35 @@ class TrackMap:
 
     def _near(self, pose: Pose, x: float, reach: float, planned: bool) -> tuple[Vector, Vector, Vector] | None:
         """Distances from the place, y and weights of the points that bear on it."""
-        seen = self._points[: min(self._count, CAPACITY)]
-        points = np.concatenate((seen, self._planned)) if planned and len(self._planned) else seen
-        if len(points) < NEEDED:
+        ahead, y, w, seen = self._around(pose)
+        if not planned:
+            ahead, y, w = ahead[:seen], y[:seen], w[:seen]
+        d = ahead - x
+        keep = np.abs(d) < reach
+        if np.count_nonzero(keep) < NEEDED:
             return None
+        d, y, w = d[keep], y[keep], w[keep]
+        part = d * (1.0 / reach)
+        part *= part
+        np.subtract(1.0, part, out=part)
+        part *= part
+        part *= w
+        return d, y, part
+
+    def _around(self, pose: Pose) -> tuple[Vector, Vector, Vector, int]:
+        """Points near a pose in its body frame, weights, and how many of them were seen; kept, since several fits ask for them."""
+        if self._local is not None and self._local[0] == pose:
+            return self._local[1]
+        seen = self._points[: min(self._count, CAPACITY)]
+        points = np.concatenate((seen, self._planned)) if len(self._planned) else seen
         cos, sin = math.cos(pose.heading), math.sin(pose.heading)
         dx, dy = points[:, 0] - pose.x, points[:, 1] - pose.y
-        d = dx * cos + dy * sin - x
-        y = dy * cos - dx * sin
-        keep = (np.abs(d) < reach) & (np.abs(y) < 0.7)
-        if int(keep.sum()) < NEEDED:
-            return None
-        d, y = d[keep], y[keep]
-        part = 1.0 - (d / reach) ** 2
-        weights: Vector = points[keep, 2] * part * part
-        return d, y, weights
+        x, y = dx * cos + dy * sin, dy * cos - dx * sin
+        keep = (np.abs(x - 0.45) < 0.8) & (np.abs(y) < 0.7)
+        number = np.count_nonzero(keep[: len(seen)])
+        found = x[keep], y[keep], points[keep, 2], int(number)
+        self._local = (pose, found)
+        return found
 
 
 def _weighted(d: Vector, y: Vector, w: Vector, degree: int) -> Fit | None:
