@@ -5,10 +5,42 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 from sim.course import Course, Outcome
 from sim.oracle import Oracle, Verdict
+
+PLOTS: Final = {
+    "catch_map": {
+        "kind": "lines",
+        "title": "The table from above: from the release to where each ball left",
+        "x": "courses.start_y",
+        "y": "courses.start_x",
+        "x2": "courses.exit_y",
+        "y2": "courses.exit_x",
+        "x_label": "across the table, y (m)",
+        "y_label": "away from the arm, x (m)",
+        "colour": "throws.outcome",
+    },
+    "exits": {
+        "kind": "points",
+        "title": "Where and how fast each ball left the table",
+        "x": "courses.exit_y",
+        "y": "courses.exit_speed",
+        "x_label": "y at the near edge (m)",
+        "y_label": "speed (m/s)",
+        "colour": "throws.outcome",
+    },
+    "misses": {
+        "kind": "histogram",
+        "title": "How far from the middle of the cup's mouth each ball came",
+        "x": "throws.miss_mm",
+        "most": 150.0,
+        "x_label": "distance (mm), up to 150",
+        "colour": "throws.outcome",
+    },
+}
+"""Pictures that reports draw of these results (docs/campaigns.md)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +83,10 @@ class Referee:
             "seed": self._seed,
             "regime": self._regime,
             "throws": rows,
-            "courses": [_course(entry, self._began) for entry in self._entries],
+            "courses": [
+                _course(entry, self._began, status["run"]) for entry, status in zip(self._entries, rows, strict=True)
+            ],
+            "plots": PLOTS,
             "over": len(over),
             "caught": sum(row["caught"] for row in over),
             "reachable": sum(row["reachable"] for row in over),
@@ -63,8 +98,8 @@ def _status(course: Course, now: float, cycles: Sequence[Mapping[str, Any]]) -> 
     age = now - course.released_at
     for cycle in cycles:
         if cycle["begun_ago"] >= age >= cycle["ended_ago"]:
-            return {"status": cycle["status"], "cause": cycle.get("cause", "")}
-    return {"status": None, "cause": ""}
+            return {"status": cycle["status"], "cause": cycle.get("cause", ""), "run": cycle.get("n")}
+    return {"status": None, "cause": "", "run": None}
 
 
 def _row(entry: _Entry) -> dict[str, Any]:
@@ -80,15 +115,19 @@ def _row(entry: _Entry) -> dict[str, Any]:
     }
 
 
-def _course(entry: _Entry, began: float) -> dict[str, Any]:
+def _course(entry: _Entry, began: float, run: int | None) -> dict[str, Any]:
     """How one throw went, in m, m/s and s; durations count from its release, None: it did not happen."""
     course, exit_state = entry.course, entry.course.exit_state
     return {
         "n": course.throw.n,
+        "run": run,
+        "start_x": course.throw.start.position[0],
+        "start_y": course.throw.start.position[1],
         "released_after": course.released_at - began,
         "spin_share": course.throw.spin_share,
         "rolling_resistance": course.throw.rolling_resistance,
         "exit_after": _finite(course.exit_time),
+        "exit_x": exit_state.position[0] if exit_state else None,
         "exit_y": exit_state.position[1] if exit_state else None,
         "exit_speed": math.hypot(*exit_state.velocity) if exit_state else None,
         "caught_after": _finite(course.caught_at),

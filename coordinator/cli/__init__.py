@@ -47,6 +47,7 @@ COMMANDS = (
     Command("estop", "emergency stop, straight to the nodes and their bus"),
     Command("log", "print or export a recorded run"),
     Command("campaign", "run a task many times in parallel lock-step cells"),
+    Command("report", "write a report of a run or a campaign, or compare two campaigns"),
     Command("forecast", "forecast further runs from measured ones, and compare"),
     Command("learned", "what was learned: show, merge, freeze, reset an estimates file"),
     Command("replay", "derive a recorded run again and compare"),

@@ -46,7 +46,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="of all chance (%(default)s)")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the task")
-    parser.add_argument("--block", type=_positive, default=5, metavar="N", help="throws in one cell (%(default)s)")
+    parser.add_argument(
+        "--block", type=_positive, metavar="N", help="runs in one cell (as many as the task's runs place holds)"
+    )
     parser.add_argument(
         "--batch",
         type=_positive,
@@ -159,11 +161,17 @@ def _plan(options: argparse.Namespace, task: Task) -> Plan:
         selector=options.selector,
         chosen=chosen,
         parameters={name: parameter_of(task, name, text) for name, text in given.items()},
-        block=options.block if task.runs_place else 1,
+        block=_block(task, options.block),
         batch=options.batch if learns(options.selector) else 0,
         options=_selector_options(options),
         digests={key: digest(path) for key, path in paths.items()},
     )
+
+
+def _block(task: Task, wanted: int | None) -> int:
+    if not task.runs_place:
+        return 1
+    return wanted or max(1, task.places[task.runs_place].tokens)
 
 
 def _selector_options(options: argparse.Namespace) -> dict[str, Any]:

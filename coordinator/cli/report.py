@@ -1,0 +1,158 @@
+"""Write a report of a mission run or a campaign: one self-contained HTML page, and its pictures as SVG files."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from coordinator.cli import CommandError
+from coordinator.cli.loading import load_task, write_json
+
+if TYPE_CHECKING:
+    from coordinator.campaign.plan import Plan
+    from coordinator.campaign.rows import Row
+    from coordinator.task import Task
+
+EXAMPLE = "petrobot report campaigns/catch_ball-nikolic_fu-1 --against campaigns/catch_ball-fixed-1 --out report.html"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument(
+        "subject", metavar="RUN|CAMPAIGN", help="a recorded run (id, folder, last) or a campaign's folder"
+    )
+    parser.add_argument("--against", metavar="CAMPAIGN", type=Path, help="compare with this campaign, throw by throw")
+    parser.add_argument(
+        "--out", metavar="FILE", type=Path, help="the page (default: report.html beside what it is about)"
+    )
+    parser.add_argument("--json", metavar="FILE", help="write the comparison's numbers as JSON (- for standard output)")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Write page and pictures."""
+    from coordinator.campaign.plan import MANIFEST, CampaignError
+
+    folder = Path(options.subject)
+    try:
+        if (folder / MANIFEST).exists():
+            page, pictures, target = _campaign(folder, options)
+        elif options.against is not None:
+            raise CommandError(2, f"{folder} is no campaign: --against compares two campaigns")
+        else:
+            page, pictures, target = _run(options.subject)
+    except CampaignError as fault:
+        raise CommandError(2, str(fault)) from fault
+    _write(options.out or target, page, pictures, quiet=options.json == "-")
+    return 0
+
+
+def _write(page: Path, html: str, pictures: Mapping[str, str], *, quiet: bool) -> None:
+    from coordinator.report.page import standalone
+
+    beside = page.with_name(f"{page.stem}_pictures")
+    try:
+        beside.mkdir(parents=True, exist_ok=True)
+        page.write_text(html, encoding="utf-8")
+        for name, svg in pictures.items():
+            (beside / f"{name}.svg").write_text(standalone(svg), encoding="utf-8")
+    except OSError as fault:
+        raise CommandError(2, f"{page}: {fault.strerror or fault}; give --out a file that can be written") from fault
+    if not quiet:
+        print(f"report: {page}")
+        print(f"pictures: {beside} ({len(pictures)} SVG files)")
+
+
+# --- campaigns -----------------------------------------------------------------------------------------------------------
+
+
+def _campaign(folder: Path, options: argparse.Namespace) -> tuple[str, dict[str, str], Path]:
+    from coordinator.report.campaign_page import CampaignReport, comparison_pictures, comparison_section
+
+    plan, task, rows = opened(folder)
+    report = CampaignReport(plan, task, rows, _plots(folder))
+    more: list[str] = []
+    if options.against is not None:
+        found = compared(folder, options.against)
+        one, other = _names(folder, options.against)
+        pictures = comparison_pictures(found, one, other)
+        more = [comparison_section(found, one, other)]
+        report.pictures = {**pictures, **report.pictures}
+        if options.json:
+            write_json(options.json, found)
+    return report.html(more), {name: svg for name, (_, svg) in report.pictures.items()}, folder / "report.html"
+
+
+def _names(one: Path, other: Path) -> tuple[str, str]:
+    names = (one.resolve().name, other.resolve().name)
+    return names if names[0] != names[1] else (str(one), str(other))
+
+
+def opened(folder: Path) -> tuple[Plan, Task, list[Row]]:
+    """Plan, task and rows of a campaign. Raises CampaignError, and CommandError without rows."""
+    from coordinator.campaign.plan import read_manifest
+    from coordinator.campaign.table import TABLE, read_table
+
+    plan = read_manifest(folder)
+    rows = list(read_table(folder / TABLE))
+    if not rows:
+        raise CommandError(2, f"{folder}: the table holds no run yet")
+    return plan, load_task(plan.task), rows
+
+
+def compared(one: Path, other: Path) -> dict[str, Any]:
+    """The numbers of a comparison of two campaigns' folders."""
+    from coordinator.report.comparing import compare
+
+    _, task, rows = opened(one)
+    _, _, others = opened(other)
+    try:
+        return {"one": one.name, "other": other.name, **compare(task, rows, others)}
+    except ValueError as fault:
+        raise CommandError(2, str(fault)) from fault
+
+
+def _plots(folder: Path) -> dict[str, Any]:
+    path = folder / "plots.json"
+    if not path.exists():
+        return {}
+    found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return found
+
+
+# --- runs ----------------------------------------------------------------------------------------------------------------
+
+
+def _run(name: str) -> tuple[str, dict[str, str], Path]:
+    from coordinator.cli.replaying import recorded
+    from coordinator.drawing import draw
+    from coordinator.journal import JournalError
+    from coordinator.recording import ReplayError
+    from coordinator.report.run_page import gantt_svg, own_pictures, report_html
+    from coordinator.runfolder import RESULT
+    from coordinator.timeline import Timeline
+
+    found = recorded(name)
+    timeline = Timeline()
+    try:
+        for step in found.steps():
+            timeline.stimulus(step.time, step.stimulus)
+            for instruction in step.instructions:
+                timeline.instruction(step.time, instruction)
+    except JournalError as fault:
+        raise CommandError(2, str(fault)) from fault
+    except ReplayError as fault:
+        raise CommandError(1, str(fault)) from fault
+    folder = found.journal.path.parent
+    path = folder / RESULT
+    header = found.journal.header
+    result = (
+        json.loads(path.read_text(encoding="utf-8"))
+        if path.exists()
+        else {"task": found.task.name, "reason": "no result"}
+    )
+    page = report_html({**result, "mission": header["mission"]}, timeline, draw(found.task, error_branches=True))
+    pictures = {f"own_{i}": svg for i, svg in enumerate(own_pictures(result).values(), 1)}
+    return page, {"gantt": gantt_svg(timeline), **pictures}, folder / "report.html"

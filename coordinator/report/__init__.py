@@ -1,0 +1,5 @@
+"""Reports: a mission run or a campaign as one self-contained HTML page with SVG pictures, and two campaigns compared."""
+
+from coordinator.report.run_page import report_html
+
+__all__ = ["report_html"]

@@ -1,0 +1,302 @@
+"""A campaign as one HTML page: shares, choices and J over trials, R and C of actions, the task's own pictures, faults."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any
+
+from coordinator.campaign.observed import regime_of
+from coordinator.campaign.plan import Plan
+from coordinator.campaign.rows import Row
+from coordinator.campaign.summary import Summary, comparisons
+from coordinator.campaign.throws import Throw
+from coordinator.learning.objective import Figures, break_even, pareto
+from coordinator.report import charts
+from coordinator.report.page import gallery, html_page, section, table, text
+from coordinator.report.plots import declared
+from coordinator.report.run_page import gantt_svg
+from coordinator.report.trials import Trials, learned_curves, objective_curves
+from coordinator.task import Status, Task
+from coordinator.timeline import Bar, Timeline
+
+WORST = 40
+"""Throws that went wrong which are listed."""
+LATENCY = "latency"
+"""Numbers of results whose names begin so are drawn: seconds from an image to the set point that it led to, and the like."""
+
+
+class CampaignReport:
+    """Pictures and page of a campaign. `pictures` holds every picture by file name, with its heading."""
+
+    def __init__(self, plan: Plan, task: Task, rows: Sequence[Row], plots: Mapping[str, Any]) -> None:
+        self.plan, self.task, self.rows = plan, task, rows
+        self.summary = Summary.of(task, rows)
+        self.trials = objective_curves(task, rows)
+        learned_curves(plan, rows, self.trials)
+        self.pictures: dict[str, tuple[str, str]] = {}
+        self._trials()
+        self._actions()
+        self._own(plots)
+        self._times()
+        self._gantt()
+
+    def _add(self, name: str, heading: str, svg: str) -> None:
+        self.pictures["".join(c if c.isalnum() else "_" for c in name)] = (heading, svg)
+
+    # --- pictures ----------------------------------------------------------------------------------------------------
+
+    def _trials(self) -> None:
+        word = "choice probability" if self.plan.batch else "share of choices"
+        for one in self.trials:
+            where = f"{one.primitive_task}{', ' + one.regime if one.regime else ''}"
+            if one.probability:
+                svg = charts.lines(f"{where}: {word}", "trial", word, one.probability, unit=True)
+                self._add(f"probability {where}", "Choices and J over trials", svg)
+            if one.objective:
+                svg = charts.lines(f"{where}: J = 1 - R + rho C", "trial", "J", _settled(one))
+                self._add(f"objective {where}", "Choices and J over trials", svg)
+
+    def _actions(self) -> None:
+        for primitive in self.task.primitive_tasks:
+            reliability, cost = [], []
+            for key, tally in sorted(self.summary.estimates.tallies.items()):
+                if key.primitive_task != primitive or not tally.runs:
+                    continue
+                low, high = tally.interval()
+                reliability.append((key.action, regime_of(key.context), low, tally.reliability, high))
+                spent = tally.cost(self.task.primitive_tasks[primitive].cost)
+                if spent.n:
+                    half = 1.96 * spent.deviation / spent.n**0.5
+                    cost.append((key.action, regime_of(key.context), spent.mean - half, spent.mean, spent.mean + half))
+            if reliability:
+                title = f"{primitive}: R with 95 % interval"
+                self._add(
+                    f"reliability {primitive}",
+                    "Reliability and cost of each action",
+                    charts.intervals(title, "R", reliability, unit=True),
+                )
+            if cost:
+                unit = self.task.primitive_tasks[primitive].cost
+                label = {"wall": "C (s)", "cpu": "C (s of computing)"}.get(unit, f"C ({unit.removeprefix('value:')})")
+                title = f"{primitive}: mean cost with 95 % interval"
+                self._add(
+                    f"cost {primitive}", "Reliability and cost of each action", charts.intervals(title, label, cost)
+                )
+
+    def _own(self, plots: Mapping[str, Any]) -> None:
+        scores = [{**row.score, "n": row.n, "regime": row.regime} for row in self.rows]
+        for name, svg in declared(plots, scores).items():
+            self._add(f"own {name}", "Of the task itself", svg)
+
+    def _times(self) -> None:
+        times: dict[str, list[float]] = {}
+        latencies: dict[str, list[float]] = {}
+        for row in self.rows:
+            if row.throw is None:
+                continue
+            if row.throw.time is not None:
+                times.setdefault(row.regime or "time", []).append(row.throw.time)
+            for run in row.throw.runs:
+                for name, value in run.values.items():
+                    if name.startswith(LATENCY):
+                        latencies.setdefault(f"{run.action}: {name}", []).append(value)
+        if times:
+            self._add("times", "Times", charts.histogram("Time of a run of the task", "s", times))
+        if latencies:
+            self._add("latencies", "Times", charts.histogram("Latencies that runs reported", "s", latencies))
+
+    def _gantt(self) -> None:
+        block = next((row.block for row in self.rows if row.throw is not None), None)
+        chosen = [row for row in self.rows if row.block == block and row.throw is not None]
+        if chosen:
+            self._add("gantt", f"Runs over time: first cell, seed {chosen[0].seed}", gantt_svg(timeline_of(chosen)))
+        bad = next(
+            (r for r in self.rows if r.throw and r.throw.status == Status.ERROR.value and r.block != block), None
+        )
+        if bad is not None:
+            same = [row for row in self.rows if row.block == bad.block and row.throw is not None]
+            self._add(
+                "gantt error", f"Runs over time: a cell with an error, seed {bad.seed}", gantt_svg(timeline_of(same))
+            )
+
+    # --- page --------------------------------------------------------------------------------------------------------
+
+    def html(self, more: Sequence[str] = ()) -> str:
+        """The page; `more` are further sections, put behind the numbers."""
+        plan = self.plan
+        lead = f"{len(self.rows)} of {plan.runs} runs, selector {plan.selector}, seed {plan.seed}"
+        headings = list(dict.fromkeys(heading for heading, _ in self.pictures.values()))
+        parts = [
+            f"<h1>{escape(self.task.name)}: campaign</h1>",
+            f'<p class="lead">{escape(lead)}</p>',
+            section("Results", table(self._results())),
+            *more,
+            *(section(h, self._gallery(h)) for h in headings[:2]),
+            section("Actions", "".join(self._judged())),
+            *(section(h, self._gallery(h)) for h in headings[2:]),
+            section("Ends of runs and their causes", table(self._causes())),
+            section("What went wrong, firing by firing", self._worst()),
+        ]
+        return html_page(f"{self.task.name}: campaign", parts)
+
+    def _gallery(self, heading: str) -> str:
+        return gallery(svg for own, svg in self.pictures.values() if own == heading)
+
+    def _results(self) -> list[dict[str, Any]]:
+        whole = self.summary.to_plain()
+        parts = [*whole["by_regime"].items(), ("all", whole)]
+        return [
+            {
+                "regime": name or "-",
+                "runs": part["runs"],
+                "R_goal": part["R_goal"],
+                "95 %": f"{part['wilson'][0]:.4f} to {part['wilson'][1]:.4f}",
+                "P_complete": part["P_complete"],
+                "R_conj": part["R_conj"],
+                "mean time (s)": part["mean"],
+                "90 % of times below (s)": part["q90"],
+            }
+            for name, part in parts
+        ]
+
+    def _judged(self) -> list[str]:
+        out = []
+        for primitive, judged in comparisons(self.task, self.summary.estimates.tallies).items():
+            front = {f.action for f in pareto(judged.figures)}
+            best = next((f for f in judged.figures if f.action == judged.best), None)
+            rows = [_action_row(f, front, best) for f in judged.figures]
+            out.append(f"<h3>{escape(primitive)} <small>rho = {judged.rho:.4g}</small></h3>{table(rows)}")
+        return out
+
+    def _causes(self) -> list[dict[str, Any]]:
+        counts: dict[tuple[str, str, str, str, str], int] = {}
+        first: dict[tuple[str, str, str, str, str], Row] = {}
+        for row in self.rows:
+            for run in row.throw.runs if row.throw is not None else ():
+                key = (row.regime, run.place, run.action, run.status or "none", run.cause)
+                counts[key] = counts.get(key, 0) + 1
+                first.setdefault(key, row)
+        return [
+            {
+                **dict(zip(("regime", "place", "action", "status", "cause"), key, strict=True)),
+                "runs": n,
+                "first seen": f"seed {first[key].seed}, run {first[key].k}",
+            }
+            for key, n in sorted(counts.items())
+        ]
+
+    def _worst(self) -> str:
+        bad = [row for row in self.rows if row.throw is not None and row.throw.status != Status.SUCCESS.value]
+        rows = [
+            {
+                "n": row.n,
+                "regime": row.regime,
+                "seed": row.seed,
+                "run": row.k,
+                "status": row.throw.status,
+                "firings": story(row.throw),
+            }
+            for row in bad[:WORST]
+            if row.throw is not None
+        ]
+        if not rows:
+            return "<p>Nothing: every run met its specification.</p>"
+        left = f"<p>{len(bad) - WORST} more in the table.</p>" if len(bad) > WORST else ""
+        return f"<details open><summary>{len(bad)} runs of the task</summary>{table(rows)}{left}</details>"
+
+
+def _settled(trials: Trials) -> dict[str, list[tuple[float, float]]]:
+    """J curves without the first few trials, where a single failure hides everything else."""
+    last = max((points[-1][0] for points in trials.objective.values()), default=0.0)
+    kept = {a: [p for p in points if p[0] > 0.02 * last] or points for a, points in trials.objective.items()}
+    return dict(kept)
+
+
+def _action_row(f: Figures, front: set[str], best: Figures | None) -> dict[str, Any]:
+    even = break_even(best, f) if best is not None and best.action != f.action else None
+    return {
+        "action": f.action + (" (lowest J)" if best is not None and f.action == best.action else ""),
+        "runs": f.runs,
+        "R": f.reliability,
+        "95 %": f"{f.lower:.3f} to {f.upper:.3f}",
+        "availability": f.availability,
+        "C": f.cost,
+        "hardest regime": regime_of(f.scenario or ""),
+        "J": f.j,
+        "not beaten in both R and C": f.action in front,
+        "same J as the best at rho": even,
+    }
+
+
+def timeline_of(rows: Sequence[Row]) -> Timeline:
+    """The runs of a mission run as bars."""
+    made = Timeline()
+    for row in rows:
+        for i, run in enumerate(row.throw.runs if row.throw is not None else ()):
+            assert row.throw is not None
+            begun = row.throw.begun + run.begun
+            key = f"{run.place} of run {row.k}" + (f" ({i})" if i else "")
+            status = Status(run.status) if run.status else None
+            made.bars[key] = Bar(key, run.place, run.action, begun, begun + run.took, status, run.cause, run.text)
+    return made
+
+
+def story(throw: Throw) -> str:
+    """A throw in one line: what ended when and how, and which transition took it."""
+    ends = sorted(throw.runs, key=lambda run: run.begun + run.took)
+    parts = []
+    for run in ends:
+        how = (run.status or "preempted").upper() if run.status != Status.SUCCESS.value else "success"
+        why = f" ({run.cause}: {run.text})" if run.cause and run.text else f" ({run.cause})" if run.cause else ""
+        parts.append(f"{run.begun + run.took:.2f} s {run.action} {how}{why}, {run.taken or 'not taken'}")
+    return "; ".join(parts)
+
+
+def comparison_section(found: Mapping[str, Any], one: str, other: str) -> str:
+    """Two campaigns side by side."""
+    shares = [
+        {
+            "share": name,
+            one: row["one"],
+            other: row["other"],
+            "difference": row["difference"],
+            "95 %": _interval(row["interval"]),
+            f"only {one}": row["only_one"],
+            f"only {other}": row["only_other"],
+            "p (McNemar)": row["p"],
+        }
+        for name, row in found["shares"].items()
+    ]
+    rest = [
+        {
+            "figure": name,
+            one: row["one"],
+            other: row["other"],
+            "difference": row["difference"],
+            "95 %": _interval(row["interval"]),
+        }
+        for name, row in [
+            *((f"J of {n}" if n != "mean" else "mean J", r) for n, r in found["J"].items()),
+            ("mean time (s)", found["time"]),
+        ]
+        if "difference" in row
+    ]
+    lead = f"<p>{found['pairs']} pairs of throws with equal seeds; {found['left_out']} throws without a partner.</p>"
+    return section(f"{one} against {other}", lead + table(shares) + table(rest))
+
+
+def _interval(ends: Sequence[float]) -> str:
+    return f"{text(ends[0])} to {text(ends[1])}"
+
+
+def comparison_pictures(found: Mapping[str, Any], one: str, other: str) -> dict[str, tuple[str, str]]:
+    """Differences with their intervals."""
+    rows = [(name, "", *_ends(row)) for name, row in found["shares"].items()]
+    rows += [(f"J of {name}" if name != "mean" else "mean J", "", *_ends(row)) for name, row in found["J"].items()]
+    svg = charts.intervals(f"{one} minus {other}, 95 % intervals, paired", "difference", rows)
+    return {"comparison": (f"{one} against {other}", svg)}
+
+
+def _ends(row: Mapping[str, Any]) -> tuple[float, float, float]:
+    return float(row["interval"][0]), float(row["difference"]), float(row["interval"][1])
