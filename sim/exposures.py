@@ -79,6 +79,8 @@ def camera_of(cell: Mapping[str, Any], truth: Truth, rng: np.random.Generator) -
         "distortion": true.distortion,
         "table_top": truth.table.top,
         "near_edge": truth.table.near_edge,
+        "light_gradient": truth.light_gradient,
+        "vignetting": truth.vignetting,
     }
     key = repr((view, [cell[part] for part in ("camera", "table", "ball", "cup")]))
     if key not in _BUILT:

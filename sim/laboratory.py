@@ -66,6 +66,7 @@ class Laboratory(LaboratoryParty):
             self._world.close()
         self.truth = truth
         self._mount = CupMount(self._site.arm, truth)
+        self._arm_dt = float(truth.settings["step"]["arm"])
         self._world = self.world = World(self._site.cell, truth)
         self.thrower = Thrower(self._site.cell, truth, seed, throws)
         self.referee = Referee(seed, truth.regime, Oracle(self._site.arm, truth, self._site.cell), now)
@@ -150,22 +151,20 @@ class Laboratory(LaboratoryParty):
         return all(-near < angle - at < near for angle, at in zip(self.plant.q, self._home, strict=True))
 
     def _move(self, now: float) -> None:
-        """The world goes on by a tick, the arm in steps of 1 ms, the ball as finely as it needs."""
+        """The world goes on by a tick: in fine steps while the ball may touch something, else in the arm's own."""
         world, bus = self.world, self.bus
-        dt = world.fine_dt
-        steps = round(TICK / dt)
-        if world.ball is None:
-            for step in range(steps):
-                bus.step(now + step * dt, dt)
+        if world.ball is not None:
+            world.begin(now, self._cup_now)
+        fine = world.fine
+        dt = world.fine_dt if fine else self._arm_dt
+        for step in range(round(TICK / dt)):
+            bus.step(now + step * dt, dt)
+            if fine and world.fine:
+                world.fine_step(now + (step + 1) * dt, self._cup_now())
+        if world.ball is not None:
+            world.end(now + TICK, self._cup_now)
+        else:
             world.idle(now + TICK)
-            bus.ball(world.barrier)
-            return
-        world.begin(now, self._cup_now)
-        for step in range(1, steps + 1):
-            bus.step(now + (step - 1) * dt, dt)
-            if world.fine:
-                world.fine_step(now + step * dt, self._cup_now())
-        world.end(now + TICK, self._cup_now)
         bus.ball(world.barrier)
 
     def _cup_now(self) -> Frame3:

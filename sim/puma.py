@@ -19,8 +19,8 @@ from sim.puma_urdf import urdf
 from sim.truth import Vector
 
 _REFRESH = (0.01, 0.01, 0.1, 0.1)
-"""rad, of joints 2 to 5; the mass matrix is computed anew when a joint has moved so far: it changes by less than 1 % meanwhile. It does not
-depend on joint 1, and on the wrist only by its light links."""
+"""rad, of joints 2 to 5; the mass matrix is computed anew when a joint has moved so far: it changes by less than 1 % meanwhile.
+It does not depend on joint 1, and on the wrist only by its light links."""
 _STILL = 1e-4
 """rad/s; slower than this and held by friction, a joint stops."""
 _STICTION = 1.05

@@ -74,6 +74,10 @@ class Truth:
     table: TableTruth
     joint_zero: Vector
     """(6,) rad; the arm's true joint angle is the encoder's plus this."""
+    light_gradient: tuple[float, float]
+    """Relative change of the light from one side of the image to the other, along u and v."""
+    vignetting: float
+    """Relative loss of light in the image's corners."""
     light_level: float
     light_drift: float
     light_period: float
@@ -138,6 +142,8 @@ def read_truth(cell: Mapping[str, Any], regime: str = "A", laboratory: Path = LA
             cup=_cup(cell["cup"], errors, values, rng),
             table=_table(cell["table"], errors, rng),
             joint_zero=rng.normal(0.0, errors["joint_zero"], 6),
+            light_gradient=(float(values["light_gradient"][0]), float(values["light_gradient"][1])),
+            vignetting=float(values["vignetting"]),
             light_level=float(values["light_level"]),
             light_drift=float(values["light_drift"]),
             light_period=float(values["light_period"]),

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from services.motion.kinematics import Puma
-from services.motion.limits import Guard
+from services.motion.limits import Guard, Point
 from services.motion.model import nominal_arm, nominal_cell
 from services.motion.steering import CLOSER, Steering
 from services.motion.trajectory import Trajectory
@@ -121,3 +121,36 @@ def test_a_closer_guard_lets_pass_what_a_wider_one_refuses() -> None:
     assert GUARD.violation(HOME.tolist()) == ""
     assert wide.violation(HOME.tolist()) == "cup at the table"
     assert wide.closer(0.05).violation(HOME.tolist()) == ""
+
+
+class Thorough(Guard):
+    """Looks at everything, however far the arm is from it."""
+
+    def _arm_far(self, elbow: Point, wrist: Point) -> bool:
+        return False
+
+    def _far(self, wrist: Point) -> bool:
+        return False
+
+
+@settings(max_examples=400)
+@given(ANGLES)
+def test_an_arm_that_is_far_from_everything_touches_nothing(angles: tuple[float, ...]) -> None:
+    """The short cuts for an arm that is far away never hide a touch."""
+    for margins in ((0.0, 0.0), (0.005, 0.01), (0.05, 0.05)):
+        assert Guard(PUMA, ARM, CELL, *margins).violation(angles) == Thorough(PUMA, ARM, CELL, *margins).violation(
+            angles
+        )
+
+
+@settings(max_examples=40)
+@given(NEARBY, st.integers(1, 60))
+def test_a_rest_pose_found_clear_is_not_taken_for_another_arms(offset: tuple[float, ...], cycles: int) -> None:
+    guard = Guard(PUMA, ARM, CELL)
+    moving, stuck = (Trajectory(HOME.tolist(), 0.004, ARM.speed.tolist(), ARM.acceleration.tolist()) for _ in range(2))
+    moving.aim((HOME + offset).tolist())
+    stuck.reset(np.radians([18.7, 30.0, -190.0, 6.7, 48.6, 3.4]).tolist())
+    for _ in range(cycles):
+        guard.advance(moving)
+        assert guard.stops_clear(moving) == (GUARD.violation(moving.resting(moving.q, moving.qd)) == "")
+        assert not guard.stops_clear(stuck)
