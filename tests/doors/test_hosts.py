@@ -1,0 +1,220 @@
+"""Doors between hosts: nothing listens beyond loopback without a key, local services stay local, secrets stay out of every output."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import re
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from coordinator.certificates import make_certificates
+from coordinator.door_file import DOOR
+from coordinator.launch import local_programs
+from coordinator.supervisor import Supervisor
+from services.comm.directory import parse
+from services.comm.security import new_key, write_key
+from tests.doors.arm_cell import ROOT, cell_in
+from tests.doors.conftest import KEY, Victim
+
+pytestmark = pytest.mark.processes
+Start = Callable[..., Victim]
+CERTIFICATES = '\n[keys]\ncertificates = "keys"\n'
+SHARED = '\n[keys]\nfile = "cell.key"\n'
+
+
+def run(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """A module of ours as a process."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", *arguments]
+    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, check=False, timeout=120)
+
+
+@pytest.mark.parametrize("program", ["services", "sim"])
+def test_a_node_does_not_listen_beyond_this_host_without_a_key(tmp_path: Path, program: str) -> None:
+    """Exit code 2 and one line that says what to do; with a key the same address is taken."""
+    directory = cell_in(tmp_path)
+    node = "motion" if program == "services" else "laboratory"
+    port = directory.nodes[node].port
+    text = directory.source.read_text().replace(
+        f'host = "127.0.0.1"\nport = {port}', f'host = "0.0.0.0"\nport = {port}'
+    )
+    directory.source.write_text(text)
+    arguments = [program, *([node] if program == "services" else []), "--services", str(directory.source)]
+    done = run(*arguments)
+    assert done.returncode == 2
+    assert f"{node}: refuses to listen on 0.0.0.0" in done.stderr and "`petrobot keys`" in done.stderr
+
+
+# --- another host --------------------------------------------------------------------------------------------------------
+
+
+ELSEWHERE = """
+import asyncio, json, sys
+from services.comm import messages as m
+from services.comm.caller import Caller
+from services.comm.client import Client
+
+async def main():
+    hello = m.Hello(1, 1, "coordinator", "far", "f1", 1)
+    client = Client(sys.argv[1], int(sys.argv[2]), Caller("vision", hello, auto_ack=True), key=bytes.fromhex(sys.argv[3]))
+    client.start()
+    async with asyncio.timeout(20):
+        assert await client.connected(15)
+        echo, tune = await client.call("echo", {"n": 1}), await client.call("tune", {"n": 1})
+    told = {"offers": client.caller.offers, "echo": echo.status, "tune": [tune.status, tune.cause, tune.executed]}
+    print(json.dumps(told))
+    await client.close()
+
+asyncio.run(main())
+"""
+
+
+def ip(*arguments: str) -> None:
+    """One command of ip(8)."""
+    subprocess.run(["ip", *arguments], capture_output=True, check=True)
+
+
+@pytest.fixture
+def other_host() -> Iterator[tuple[str, str]]:
+    """A network namespace with a cable to this one: its name, and this host's address on the cable."""
+    number = os.getpid() % 200 + 20
+    name, here, there = f"pb{os.getpid()}", f"pbh{os.getpid() % 99999}", f"pbn{os.getpid() % 99999}"
+    address = f"10.213.{number}.1"
+    try:
+        ip("netns", "add", name)
+    except (OSError, subprocess.CalledProcessError) as fault:
+        pytest.skip(f"a second host needs network namespaces (root and ip(8)): {fault}")
+    try:
+        ip("link", "add", here, "type", "veth", "peer", "name", there, "netns", name)
+        ip("addr", "add", f"{address}/24", "dev", here)
+        ip("link", "set", here, "up")
+        ip("-n", name, "addr", "add", f"10.213.{number}.2/24", "dev", there)
+        ip("-n", name, "link", "set", there, "up")
+        yield name, address
+    finally:
+        ip("netns", "del", name)
+
+
+def test_a_local_service_is_out_of_reach_for_another_host(victim: Start, other_host: tuple[str, str]) -> None:
+    """With the right key, over a real cable: it is neither shown nor called; the rest is served."""
+    namespace, address = other_host
+    server = victim(key=KEY.hex(), host=address)
+    command = [sys.executable, "-c", textwrap.dedent(ELSEWHERE), address, str(server.port), KEY.hex()]
+    far = subprocess.run(
+        ["ip", "netns", "exec", namespace, *command],
+        env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False, timeout=60,
+    )  # fmt: skip
+    assert far.returncode == 0, far.stderr
+    told = json.loads(far.stdout)
+    assert told == {"offers": ["echo", "big"], "echo": "success", "tune": ["error", "local_only", "no"]}
+
+
+async def test_on_its_own_host_it_is_in_reach(victim: Start) -> None:
+    """The same service for a neighbour."""
+    server = victim()
+    client = server.client()
+    client.start()
+    async with asyncio.timeout(20.0):
+        assert (await client.call("tune", {"n": 1})).values == {"n": 1}
+    await client.close()
+
+
+# --- a whole cell with keys ----------------------------------------------------------------------------------------------
+
+
+class Guarded:
+    """The arm's cell with a key or certificates, and everything that it has printed and written."""
+
+    def __init__(self, folder: Path, how: str) -> None:
+        directory = cell_in(folder, speed=1.0)
+        if how == "certificates":
+            make_certificates(folder / "keys", ["coordinator", *directory.nodes])
+        else:
+            write_key(folder / "cell.key", new_key())
+        text = directory.source.read_text() + (CERTIFICATES if how == "certificates" else SHARED)
+        directory.source.write_text(text)
+        self.folder = folder
+        self.directory = parse(text, directory.source)
+        self.said: list[str] = []
+
+    def secrets(self) -> dict[str, str]:
+        """What must appear nowhere, by the file that it stands in."""
+        found = {}
+        for path in [*self.folder.glob("cell.key"), *self.folder.glob("keys/*.key")]:
+            lines = [line for line in path.read_text().splitlines() if not line.startswith("-----")]
+            found |= {f"{path.name}:{number}": line for number, line in enumerate(lines) if len(line) >= 32}
+        return found
+
+    def petrobot(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """A command; what it printed is kept."""
+        services = ["--services", str(self.directory.source)] if arguments[0] in ("run", "nodes", "estop") else []
+        done = run("coordinator", *arguments, *services, cwd=self.folder)
+        self.said += [done.stdout, done.stderr]
+        return done
+
+    def leaks(self, more: dict[str, str]) -> list[str]:
+        """Where a secret has come out: as text or as bytes, in what was printed and in every file but its own."""
+        outputs = {f"output {n}": said.encode() for n, said in enumerate(self.said)}
+        own = {path for path in self.folder.rglob("*") if path.suffix == ".key" or path.name == DOOR}
+        outputs |= {
+            str(path): path.read_bytes() for path in self.folder.rglob("*") if path.is_file() and path not in own
+        }
+        forms = [(name, form) for name, secret in (self.secrets() | more).items() for form in _forms(secret)]
+        return [f"{name} in {where}" for where, data in outputs.items() for name, form in forms if form in data]
+
+
+def _forms(secret: str) -> list[bytes]:
+    raw = [bytes.fromhex(secret)] if re.fullmatch("[0-9a-f]{64}", secret) else []
+    return [secret.encode(), *raw, *(repr(one)[2:-1].encode() for one in raw)]
+
+
+@pytest.mark.parametrize("how", ["shared key", "certificates"])
+async def test_a_guarded_cell_works_and_keeps_its_secrets(tmp_path: Path, how: str) -> None:
+    """Nodes, run, nodes, log, emergency stop: all of it works with keys, and no output, log, journal or report shows one."""
+    cell = Guarded(tmp_path, how)
+    token: dict[str, str] = {}
+
+    async def look_for_token(done: asyncio.Future[Any]) -> None:
+        while not done.done() and not token:
+            for path in tmp_path.glob(f"runs/*/{DOOR}"):
+                token["page token"] = json.loads(path.read_text() or "{}").get("token", "")
+            await asyncio.sleep(0.01)
+
+    async with Supervisor(local_programs(cell.directory), tmp_path / "logs", respawn=False, notice=cell.said.append):
+        options = ("--journal", "runs", "--report", "report", "--json", "out.json", "--no-page")
+        running = asyncio.ensure_future(asyncio.to_thread(cell.petrobot, "run", "sweeping.toml", *options))
+        await look_for_token(running)
+        done = await running
+        assert done.returncode == 0, done.stderr
+        assert json.loads((tmp_path / "out.json").read_text())["status"] == "success"
+        assert (await asyncio.to_thread(cell.petrobot, "nodes", "--json", "-")).returncode == 0
+        assert (await asyncio.to_thread(cell.petrobot, "log", "last", "--format", "jsonl")).returncode == 0
+        assert (await asyncio.to_thread(cell.petrobot, "estop", "--json", "-")).returncode == 0
+        assert cell.petrobot("estop", "--clear", "--services", str(cell.directory.source)).returncode == 0
+    assert token["page token"] and cell.secrets()
+    assert list(tmp_path.glob("logs/*.log")) and (tmp_path / "report" / "index.html").exists()
+    assert cell.leaks(token) == []
+    (tmp_path / "logs" / "planted.log").write_text(f"the key is {next(iter(cell.secrets().values()))}")
+    assert len(cell.leaks(token)) == 1, "this test could not fail"
+
+
+async def test_without_its_certificate_nobody_gives_orders_to_the_cell(tmp_path: Path) -> None:
+    """A run with another cell's certificates reaches no node: exit code 3."""
+    cell = Guarded(tmp_path, "certificates")
+    async with Supervisor(local_programs(cell.directory), tmp_path / "logs", respawn=False):
+        for name in ("ca", "coordinator"):
+            for end in ("pem", "key"):
+                (tmp_path / "keys" / f"{name}.{end}").unlink()
+        make_certificates(tmp_path / "own", ["coordinator"])
+        for path in (tmp_path / "own").iterdir():
+            path.rename(tmp_path / "keys" / path.name)
+        done = await asyncio.to_thread(cell.petrobot, "run", "sweeping.toml", "--no-page", "--quiet")
+    assert done.returncode == 3 and "motion" in done.stderr
