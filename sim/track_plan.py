@@ -16,6 +16,7 @@ PATH_COLOURS: Final = ("#d9480f", "#1c7ed6", "#2b8a3e", "#862e9c", "#c2255c", "#
 """One for each run drawn, also told apart by dashes."""
 _DASHES: Final = ("", "0.25 0.1", "0.1 0.08", "0.4 0.1 0.1 0.1", "0.02 0.08", "0.6 0.1")
 _LIGHT, _DARK = "#f4f1ea", "#34322e"
+_RIM: Final = 0.3
 _LETTER: Final = 0.52
 """Width of a letter, as a share of the font's size."""
 _ROVER: Final = ((0.18, 0.0), (0.06, 0.2), (-0.22, 0.2), (-0.22, -0.2), (0.06, -0.2))
@@ -36,7 +37,10 @@ def floor_plan(scores: Sequence[Mapping[str, Any]], names: Sequence[str] = (), *
         f'height="{WIDTH_PX * high / (right - left):.0f}" font-family="sans-serif" font-size="0.34" role="img">',
         f"<title>{escape(_title(scores[0]))}</title>",
         '<g transform="scale(1 -1)">',
+        f'<clipPath id="floor"><rect x="{left:g}" y="{bottom:g}" width="{right - left:g}" height="{top - bottom:g}"/></clipPath>',
+        '<g clip-path="url(#floor)">',
         *_squares(left, bottom, right, top),
+        "</g>",
         *_paint(track),
         *_reflectors(track),
     ]
@@ -65,21 +69,22 @@ def _title(score: Mapping[str, Any]) -> str:
 
 
 def _extent(track: Track) -> tuple[float, float, float, float]:
-    """Left, bottom, right and top of what is drawn (m): the track's squares and one around them, on the board."""
+    """Left, bottom, right and top of what is drawn (m): the track's squares and one around them as far as the board goes, and a
+    rim in which there is room for a rover at the board's edge."""
     columns = [element.square[0] for element in track.elements]
     rows = [element.square[1] for element in track.elements]
     return (
-        max(min(columns) - 1, 0) * SQUARE,
-        max(min(rows) - 1, 0) * SQUARE,
-        min(max(columns) + 2, BOARD) * SQUARE,
-        min(max(rows) + 2, BOARD) * SQUARE,
+        max(min(columns) - 1, 0) * SQUARE - _RIM,
+        max(min(rows) - 1, 0) * SQUARE - _RIM,
+        min(max(columns) + 2, BOARD) * SQUARE + _RIM,
+        min(max(rows) + 2, BOARD) * SQUARE + _RIM,
     )
 
 
 def _squares(left: float, bottom: float, right: float, top: float) -> list[str]:
     squares = []
-    for i in range(round(left / SQUARE), round(right / SQUARE)):
-        for j in range(round(bottom / SQUARE), round(top / SQUARE)):
+    for i in range(math.floor(left / SQUARE), math.ceil(right / SQUARE)):
+        for j in range(math.floor(bottom / SQUARE), math.ceil(top / SQUARE)):
             fill = _LIGHT if white((i, j)) else _DARK
             squares.append(f'<rect x="{i * SQUARE:g}" y="{j * SQUARE:g}" width="2" height="2" fill="{fill}"/>')
     return squares
