@@ -67,6 +67,7 @@ class Dispatch:
         self._timers = Timers()
         self._commands: dict[str, str] = {}
         self._command_count = 0
+        self._boots: dict[str, str] = {}
         self._kept: dict[str, Sequence[str]] = {}
         """By node: ids that it still knew when it welcomed us and nobody has settled yet."""
         self._earlier: dict[str, tuple[StartRun, str]] = {}
@@ -222,10 +223,11 @@ class Dispatch:
             self.callers[flight.node].hold(now, self.call_id(run))
         return [RunHeld(run, held)]
 
-    def back(self, now: float, node: str, same_boot: bool, runs: Sequence[str]) -> None:
+    def back(self, now: float, node: str, boot: str, runs: Sequence[str]) -> None:
         """A node has welcomed us; `runs` are the ids that it still knows."""
-        if not same_boot:
+        if self._boots.get(node, boot) != boot:
             self._fences.rebooted(now, node)
+        self._boots[node] = boot
         self._kept[node] = runs
 
     # --- time --------------------------------------------------------------------------------------------------------
@@ -261,6 +263,7 @@ class Dispatch:
         self, now: float, stimulus: Stimulus, instructions: Iterable[Instruction], boots: Mapping[str, str]
     ) -> None:
         """A step that an earlier process took at `now`: its timers and fences still count."""
+        self._boots.update(boots)
         if isinstance(stimulus, TimerFired):
             self._timers.disarm(stimulus.key)
         elif isinstance(stimulus, RunEnded | StopConfirmed):

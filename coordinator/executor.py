@@ -114,7 +114,7 @@ class Executor:
             elif isinstance(notice, Late):
                 self._queue.extend(self.dispatch.late(now, notice.outcome))
             elif isinstance(notice, PeerBack):
-                self.dispatch.back(now, node, notice.same_boot, notice.runs)
+                self.dispatch.back(now, node, notice.boot, notice.runs)
         self._work(now)
 
     def advance(self, now: float) -> None:

@@ -169,8 +169,10 @@ class Caller:
             self._messages.append(m.Subscribe(self._names))
 
     def acknowledge(self, now: float, id: str) -> None:  # noqa: A002
-        """The result of this call is safe; the peer may forget it. After a restart also of a call of the time before."""
-        if id not in self._pending and not self._settled.is_safe(id):
+        """The result of this call is safe; the peer may forget it. After a restart also of a call of the time before. One that
+        was given up here has no result yet."""
+        settled = self._settled
+        if id not in self._pending and not settled.is_safe(id) and not settled.was_given_up(id):
             self._ack(now, id)
 
     def disown(self, now: float, id: str) -> None:  # noqa: A002
