@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import random
 import ssl
 from collections.abc import Callable, Mapping
@@ -23,6 +24,8 @@ from services.comm.wire import ProtocolError, Side, State
 
 OnNotices = Callable[[float, list[Notice]], None]
 NOT_TRUSTED = "perhaps our certificate is not trusted there: it takes TLS 1.3 and certificates of its own cell alone"
+_NUMBERS = itertools.count(1)
+"""Of calls: of all clients of this process, which may have one name and boot among them."""
 _NO_ARGUMENTS: Mapping[str, Any] = {}
 AT_ONCE = 16
 """Calls that share one write: the peer takes them in while the next ones are made."""
@@ -126,7 +129,6 @@ class Client:
         self._timer: asyncio.TimerHandle | None = None
         self._armed = NEVER
         self._flushing = False
-        self._numbers = 0
         self._up = asyncio.Event()
         self._prefix = f"{caller.hello.name}/{caller.hello.boot}/"
 
@@ -169,8 +171,7 @@ class Client:
         seed: int = 0,
     ) -> asyncio.Future[Outcome]:
         """Call a service: a future of its outcome, which is acknowledged when it comes. Cancelling it cancels the call."""
-        self._numbers += 1
-        id_ = f"{self._prefix}{self._numbers}"
+        id_ = f"{self._prefix}{next(_NUMBERS)}"
         now = self.now()
         future = _Asked(loop=self.loop)
         future.asked = self, id_

@@ -19,7 +19,7 @@ from services.comm.callee import Callee, CancelRun, Offer, Order, StartRun
 from services.comm.caller import Answered, Caller, Ended, Notice, PeerBack, PeerLost
 from services.comm.client import Client
 from services.comm.codec import LIMITS, encode
-from services.comm.link import Beat, Heart, Limits, Timing
+from services.comm.link import Beat, Heart, Limits, Link, Timing
 from services.comm.messages import Executed
 from services.comm.security import KeyNeededError
 from services.comm.server import Server
@@ -111,9 +111,24 @@ async def open_node() -> AsyncIterator[Node]:
 
 
 async def _until(condition: Callable[[], bool]) -> None:
-    async with asyncio.timeout(5.0):
-        while not condition():
-            await asyncio.sleep(0.005)
+    """Wait until it holds: looked at again whenever a server, a client or a heart has done something."""
+    stirred = asyncio.Event()
+    with pytest.MonkeyPatch.context() as patch:
+        for owner, name in ((Server, "arm"), (Server, "gone"), (Client, "flush"), (Link, "_beat")):
+            patch.setattr(owner, name, _and_then(getattr(owner, name), stirred.set))
+        async with asyncio.timeout(5.0):
+            while not condition():
+                stirred.clear()
+                await stirred.wait()
+
+
+def _and_then(method: Callable[..., Any], do: Callable[[], None]) -> Callable[..., Any]:
+    def both(*arguments: Any) -> Any:
+        result = method(*arguments)
+        do()
+        return result
+
+    return both
 
 
 async def test_a_service_and_an_action(node: Node, key: bytes | None) -> None:
@@ -136,6 +151,22 @@ async def test_a_service_and_an_action(node: Node, key: bytes | None) -> None:
     await _until(lambda: not callee._results.of("coord"))
     await coordinator.client.close()
     await _until(lambda: node.server.connected == ())
+
+
+async def test_calls_of_several_clients_of_a_process_have_ids_of_their_own(open_node: Node) -> None:
+    other = Node()
+    await other.server.start("127.0.0.1", 0)
+    first, second = open_node.client(), other.client()
+    calls = [asyncio.ensure_future(one.client.call("move")) for one in (first, second)]
+    ids = {(await node.order(StartRun)).call.id for node in (open_node, other)}
+    assert len(ids) == 2, "one of them is the parent or the key of something else"
+    for call, node, told in zip(calls, (open_node, other), (first, second), strict=True):
+        callee = node.server.callee
+        callee.finish(node.server.now(), next(iter(callee.running())), "success")
+        node.server.flush()
+        assert (await call).status == "success"
+        await told.client.close()
+    await other.server.close()
 
 
 async def test_a_command_and_an_event(open_node: Node) -> None:
