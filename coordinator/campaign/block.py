@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -84,7 +85,7 @@ class BlockSelector:
 def run_block(bench: Bench, block: Block, weights: Sequence[Weights]) -> dict[str, Any]:
     """Run a block. `weights`: for each of its throws, the probabilities of each primitive task's actions.
 
-    Gives `throws` (see Throw.to_plain), `score` (one map for each throw), `plots`, `mission_s`, `cpu_s`, `wall_s`.
+    Gives `throws` (see Throw.to_plain), `score` (one map for each throw), `plots`, `mission_s`, `cpu_s`, `wall_s`, `rss_mb`.
     Raises CampaignError.
     """
     cpu, wall = time.process_time(), time.perf_counter()
@@ -114,7 +115,17 @@ def run_block(bench: Bench, block: Block, weights: Sequence[Weights]) -> dict[st
         "mission_s": round(mission.ended - mission.begun, 6),
         "cpu_s": round(time.process_time() - cpu, 4),
         "wall_s": round(time.perf_counter() - wall, 4),
+        "rss_mb": resident_mb(),
     }
+
+
+def resident_mb() -> float:
+    """Memory that this process holds now (MiB); 0 where the system does not say."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    except (OSError, IndexError, ValueError):
+        return 0.0
+    return round(pages * os.sysconf("SC_PAGE_SIZE") / 2**20, 1)
 
 
 def _cell(bench: Bench, block: Block, selector: BlockSelector) -> tuple[Mission, list[Party]]:

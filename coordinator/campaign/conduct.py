@@ -30,7 +30,7 @@ from coordinator.campaign.rows import Row, rows_of
 from coordinator.campaign.table import TABLE, Table
 
 TIMES = "times.csv"
-TIME_COLUMNS = ("block", "worker", "cpu_s", "wall_s", "mission_s")
+TIME_COLUMNS = ("block", "worker", "cpu_s", "wall_s", "mission_s", "rss_mb")
 SESSIONS = "sessions.csv"
 SESSION_COLUMNS = ("began_at", "workers", "wall_s", "blocks", "lost")
 AHEAD = 3
@@ -173,7 +173,7 @@ class Campaign:
 
 
 def _times(block: Block, result: Mapping[str, Any]) -> list[Any]:
-    return [block.index, result["pid"], result["cpu_s"], result["wall_s"], result["mission_s"]]
+    return [block.index, result["pid"], result["cpu_s"], result["wall_s"], result["mission_s"], result["rss_mb"]]
 
 
 def _append(path: Path, names: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:

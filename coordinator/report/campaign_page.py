@@ -13,6 +13,7 @@ from coordinator.campaign.summary import Summary, comparisons
 from coordinator.campaign.throws import Throw
 from coordinator.learning.objective import Figures, break_even, pareto
 from coordinator.report import charts
+from coordinator.report.combinations import by_combination
 from coordinator.report.page import gallery, html_page, section, table, text
 from coordinator.report.plots import declared
 from coordinator.report.run_page import gantt_svg
@@ -20,6 +21,8 @@ from coordinator.report.trials import Trials, learned_curves, objective_curves
 from coordinator.task import Status, Task
 from coordinator.timeline import Bar, Timeline
 
+MOST = 12
+"""Combinations that are listed."""
 WORST = 40
 """Throws that went wrong which are listed."""
 LATENCY = "latency"
@@ -134,6 +137,7 @@ class CampaignReport:
             *more,
             *(section(h, self._gallery(h)) for h in headings[:2]),
             section("Actions", "".join(self._judged())),
+            *(section(f"Combinations, regime {r or '-'}", table(rows)) for r, rows in self._combinations().items()),
             *(section(h, self._gallery(h)) for h in headings[2:]),
             section("Ends of runs and their causes", table(self._causes())),
             section("What went wrong, firing by firing", self._worst()),
@@ -168,6 +172,15 @@ class CampaignReport:
             rows = [_action_row(f, front, best) for f in judged.figures]
             out.append(f"<h3>{escape(primitive)} <small>rho = {judged.rho:.4g}</small></h3>{table(rows)}")
         return out
+
+    def _combinations(self) -> dict[str, list[dict[str, Any]]]:
+        """The best combinations of actions by regime, of throws in which each primitive task ran; none of a single one."""
+        found = {}
+        for regime in self.summary.by_regime:
+            judged = by_combination(self.task, [row for row in self.rows if row.regime == regime])
+            if len(judged) > 1:
+                found[regime] = [one.to_plain() for one in judged[:MOST]]
+        return found
 
     def _causes(self) -> list[dict[str, Any]]:
         counts: dict[tuple[str, str, str, str, str], int] = {}
@@ -277,13 +290,17 @@ def comparison_section(found: Mapping[str, Any], one: str, other: str) -> str:
             "95 %": _interval(row["interval"]),
         }
         for name, row in [
-            *((f"J of {n}" if n != "mean" else "mean J", r) for n, r in found["J"].items()),
+            *((_objective_name(n), r) for n, r in found["J"].items()),
             ("mean time (s)", found["time"]),
         ]
         if "difference" in row
     ]
     lead = f"<p>{found['pairs']} pairs of throws with equal seeds; {found['left_out']} throws without a partner.</p>"
     return section(f"{one} against {other}", lead + table(shares) + table(rest))
+
+
+def _objective_name(name: str) -> str:
+    return {"mean": "mean J", "task": "J of the whole task"}.get(name, f"J of {name}")
 
 
 def _interval(ends: Sequence[float]) -> str:
@@ -293,7 +310,7 @@ def _interval(ends: Sequence[float]) -> str:
 def comparison_pictures(found: Mapping[str, Any], one: str, other: str) -> dict[str, tuple[str, str]]:
     """Differences with their intervals."""
     rows = [(name, "", *_ends(row)) for name, row in found["shares"].items()]
-    rows += [(f"J of {name}" if name != "mean" else "mean J", "", *_ends(row)) for name, row in found["J"].items()]
+    rows += [(_objective_name(name), "", *_ends(row)) for name, row in found["J"].items()]
     svg = charts.intervals(f"{one} minus {other}, 95 % intervals, paired", "difference", rows)
     return {"comparison": (f"{one} against {other}", svg)}
 

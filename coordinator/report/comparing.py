@@ -7,7 +7,7 @@ one rho.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -122,25 +122,52 @@ def _time(pairs: Pairs) -> dict[str, Any]:
     }
 
 
+@dataclass(frozen=True)
+class Weighting:
+    """rho of each primitive task with alternatives, and of the task (whose cost is the time of a throw)."""
+
+    rho: Mapping[str, float]
+    task: float
+
+    @classmethod
+    def of(cls, task: Task, rows: Sequence[Row]) -> Weighting:
+        """1 / the largest mean cost of an action in these rows; for the task 1 / the mean time of their throws."""
+        names = [p.name for p in task.primitive_tasks.values() if len(p.alternatives) > 1]
+        times = [row.throw.time for row in rows if row.throw is not None and row.throw.time is not None]
+        mean = sum(times) / len(times) if times else 0.0
+        return cls({name: cost_weight(task, name, rows) for name in names}, 1.0 / mean if mean > 0 else 0.0)
+
+
+def objectives(task: Task, rows: Sequence[Row], weighting: Weighting) -> dict[str, float]:
+    """J of each primitive task with alternatives and of the task ("task"), with the given rho; nan where nothing was run."""
+    whole = np.ones((1, len(rows)))
+    found = {name: float(_objective(_sums(task, name, rows), whole, rho)[0]) for name, rho in weighting.rho.items()}
+    return found | {"task": float(_objective(_task_sums(rows), whole, weighting.task)[0])}
+
+
 def objective_difference(task: Task, pairs: Pairs, random: np.random.Generator) -> dict[str, Any]:
-    """J of each primitive task with alternatives, and their mean, in both campaigns; rho = 1 / the largest mean cost."""
-    names = [p.name for p in task.primitive_tasks.values() if len(p.alternatives) > 1]
-    weights = random.multinomial(len(pairs.one), np.full(len(pairs.one), 1 / len(pairs.one)), size=REPLICATES)
-    whole = np.ones((1, len(pairs.one)))
+    """J of each primitive task with alternatives, their mean, and J of the task (1 - R_goal + rho * time), in both campaigns."""
+    n = len(pairs.one)
+    weights = random.multinomial(n, np.full(n, 1 / n), size=REPLICATES)
+    whole = np.ones((1, n))
+    weighting = Weighting.of(task, (*pairs.one, *pairs.other))
     out: dict[str, Any] = {}
-    sums: list[tuple[Values, Values, Values, Values]] = []
-    for name in names:
+    means: list[tuple[float, float, Values, Values]] = []
+    for name, rho in weighting.rho.items():
         one, other = _sums(task, name, pairs.one), _sums(task, name, pairs.other)
-        rho = cost_weight(task, name, (*pairs.one, *pairs.other))
         if not one[0].sum() or not other[0].sum():
             continue
-        point = (_objective(one, whole, rho)[0], _objective(other, whole, rho)[0])
-        spread = (_objective(one, weights, rho), _objective(other, weights, rho))
-        sums.append((np.array([point[0]]), np.array([point[1]]), *spread))
-        out[name] = _difference(point[0], point[1], spread[0] - spread[1])
-    if sums:
-        means = [np.mean([s[i] for s in sums], axis=0) for i in range(4)]
-        out["mean"] = _difference(float(means[0][0]), float(means[1][0]), means[2] - means[3])
+        point = float(_objective(one, whole, rho)[0]), float(_objective(other, whole, rho)[0])
+        spread = _objective(one, weights, rho), _objective(other, weights, rho)
+        means.append((*point, *spread))
+        out[name] = _difference(*point, spread[0] - spread[1])
+    if means:
+        one_j, other_j = (float(np.mean([m[i] for m in means])) for i in (0, 1))
+        out["mean"] = _difference(one_j, other_j, np.mean([m[2] - m[3] for m in means], axis=0))
+    both = [_task_sums(rows) for rows in (pairs.one, pairs.other)]
+    values = [float(_objective(sums, whole, weighting.task)[0]) for sums in both]
+    spreads = [_objective(sums, weights, weighting.task) for sums in both]
+    out["task"] = _difference(values[0], values[1], spreads[0] - spreads[1])
     return out
 
 
@@ -148,22 +175,36 @@ def _difference(one: float, other: float, spread: Values) -> dict[str, Any]:
     known = spread[~np.isnan(spread)]
     low, high, upper = np.quantile(known, (0.025, 0.975, 0.95))
     return {
-        "one": round(float(one), 6),
-        "other": round(float(other), 6),
-        "difference": round(float(one - other), 6),
+        "one": round(one, 6),
+        "other": round(other, 6),
+        "difference": round(one - other, 6),
         "interval": [round(float(low), 6), round(float(high), 6)],
         "upper_95": round(float(upper), 6),
     }
 
 
-def _sums(task: Task, name: str, rows: tuple[Row, ...]) -> tuple[Values, Values, Values, Values]:
-    """By throw: counted runs of a primitive task, successes, cost, runs with a cost."""
+Sums = tuple[Values, Values, Values, Values]
+"""By throw: counted runs, successes, cost, runs with a cost."""
+
+
+def _sums(task: Task, name: str, rows: Sequence[Row]) -> Sums:
+    """Of a primitive task."""
     out = np.zeros((4, len(rows)))
     for i, row in enumerate(rows):
         for run in row.throw.runs if row.throw is not None else ():
             if run.status and task.primitive_task_of(run.place).name == name:
                 known = run.cost is not None
                 out[:, i] += (1.0, run.status == Status.SUCCESS.value, run.cost or 0.0, known)
+    return out[0], out[1], out[2], out[3]
+
+
+def _task_sums(rows: Sequence[Row]) -> Sums:
+    """Of the whole task: a throw is a run, a met goal its success, its time the cost."""
+    out = np.zeros((4, len(rows)))
+    for i, row in enumerate(rows):
+        if row.throw is not None:
+            time = row.throw.time
+            out[:, i] = (1.0, row.throw.goals > 0, time or 0.0, time is not None)
     return out[0], out[1], out[2], out[3]
 
 
@@ -178,7 +219,7 @@ def cost_weight(task: Task, name: str, rows: Iterable[Row]) -> float:
     return 1.0 / largest if largest > 0 else 0.0
 
 
-def _objective(sums: tuple[Values, Values, Values, Values], weights: Any, rho: float) -> Values:
+def _objective(sums: Sums, weights: Any, rho: float) -> Values:
     """J = 1 - R + rho C for each row of weights."""
     runs, successes, cost, costed = (weights @ s for s in sums)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -220,3 +220,20 @@ def test_learned_probabilities_are_derived_from_the_table(tmp_path: Path, monkey
     (look,) = [t for t in report.trials if t.primitive_task == "look"]
     assert {action: points[-1][1] for action, points in look.probability.items()} == known
     assert "probability_look__easy" in report.pictures
+
+
+def test_combinations_by_hand() -> None:
+    """Two combinations judged with one rho; the lower J first; a throw that ended early counts for what was planned."""
+    from coordinator.report.combinations import by_combination
+
+    rows = [
+        row(k, "look_quick" if k % 2 else "look_long", "success" if k % 4 else "error", 1.0 + k % 2, k % 4 > 0)
+        for k in range(40)
+    ]
+    planned = [{"look": "look_quick" if k % 2 else "look_long", "grip": "grip_soft"} for k in range(40)]
+    assert by_combination(TOY, rows) == []  # grip was never run
+    best, other = by_combination(TOY, rows, planned)
+    assert dict(best.combination)["look"] == "look_long"  # 1 - .5 + 1/2 = 1.0 and 1 - 1 + 2/2 = 1.0: the first by name
+    assert (best.objective, other.objective) == (pytest.approx(1.0), pytest.approx(1.0))
+    assert (best.goal, other.goal, best.throws) == (0.5, 1.0, 20)
+    assert other.task_objective == pytest.approx(0.0 + 2.0 / 1.5)
