@@ -43,7 +43,7 @@ async def _ask(directory: Directory, node: str, timeout: float) -> dict[str, Any
         client.flush()
         status = await asyncio.wait_for(told, timeout)
         answer |= {"offers": list(caller.offers), "boot": caller.boot, "version": NEWEST_VERSION, "status": status}
-    elif refused:
-        answer["why"] = refused[-1]
+    else:
+        answer["why"] = refused[-1] if refused else client.trouble
     await client.close()
     return answer

@@ -227,6 +227,12 @@ class Operation:
         self.feed.emit("mission", mission={"state": "stopped", "reason": f"emergency stop by {who}"})
         return answer if answer["ok"] or answer["code"] != "idle" else {"ok": True}
 
+    async def _do_clear_estop(self, who: str, data: Mapping[str, Any]) -> Answer:
+        """Devices take orders again; nothing moves by that alone."""
+        for node in self.mission.callers:
+            self._ask_node(node, "clear_emergency")
+        return {"ok": True}
+
     def _ask_node(self, node: str, verb: str) -> None:
         self._numbers += 1
         now = asyncio.get_running_loop().time()

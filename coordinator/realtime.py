@@ -42,8 +42,12 @@ class RealtimeMission:
         reached = await asyncio.gather(*(client.connected(timeout) for client in self.clients.values()))
         missing = [name for name, up in zip(self.clients, reached, strict=True) if not up]
         if missing:
-            addresses = ", ".join(f"{n} at {self.clients[n].host}:{self.clients[n].port}" for n in missing)
+            addresses = ", ".join(self._missed(name) for name in missing)
             raise UnreachableError(missing, f"no answer from {addresses}; launch them with `petrobot up`")
+
+    def _missed(self, node: str) -> str:
+        client = self.clients[node]
+        return f"{node} at {client.host}:{client.port}" + (f" ({client.trouble})" if client.trouble else "")
 
     async def run(self, begin: Callable[[float], None] | None = None) -> None:
         """Run the mission to its end, from its start or from whatever `begin(now)` makes of it. Raises MissionError."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 EXIT_CODES = """\
@@ -115,7 +115,7 @@ def _dispatch(command: Command, arguments: Sequence[str]) -> int:
     except SystemExit as leaving:
         return int(leaving.code or 0)
     try:
-        return int(module.run(options))
+        return _run(module.run, options)
     except CommandError as fault:
         print(f"petrobot {command.name}: {fault}", file=sys.stderr)
         return fault.code
@@ -125,3 +125,15 @@ def _dispatch(command: Command, arguments: Sequence[str]) -> int:
     except BrokenPipeError:
         sys.stderr.close()  # the reader went away; Python would complain once more at exit
         return 1
+
+
+def _run(run: Callable[[argparse.Namespace], int], options: argparse.Namespace) -> int:
+    """Run a command; keys that cannot be used are bad input, whichever command needs them."""
+    try:
+        return int(run(options))
+    except Exception as fault:
+        from services.comm.security import KeyFileError
+
+        if isinstance(fault, KeyFileError):
+            raise CommandError(2, str(fault)) from fault
+        raise

@@ -45,17 +45,13 @@ def run(options: argparse.Namespace) -> int:
     """Stop, or clear; 0 when every node with devices has answered, 3 otherwise."""
     from coordinator.emergency import CLEAR, STOP, order_all
     from services.comm.credentials import COORDINATOR, credentials
-    from services.comm.security import KeyFileError
 
     door = _door(options)
     path = options.services or (Path(door.services) if door is not None and door.services else None)
     directory = load_directory(path)
     verb = CLEAR if options.clear else STOP
     begun = time.perf_counter()
-    try:
-        answers = asyncio.run(order_all(directory, credentials(directory, COORDINATOR), verb, bus=options.bus))
-    except KeyFileError as fault:
-        raise CommandError(2, str(fault)) from fault
+    answers = asyncio.run(order_all(directory, credentials(directory, COORDINATOR), verb, bus=options.bus))
     took = time.perf_counter() - begun
     coordinator = asyncio.run(_tell(door)) if door is not None and not options.clear else ""
     _show(options, answers, coordinator, took)

@@ -24,6 +24,7 @@ VERBS = frozenset(
         "force_exit",
         "abort",
         "estop",
+        "clear_estop",
         "take_controls",
         "ask_controls",
         "release_controls",

@@ -1,4 +1,4 @@
-"""Doors between hosts: nothing listens beyond loopback without a key, local services stay local, secrets stay out of every output."""
+"""Doors between hosts: no listening beyond loopback without a key, local services stay local, no output shows a secret."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ class Guarded:
 
     def secrets(self) -> dict[str, str]:
         """What must appear nowhere, by the file that it stands in."""
-        found = {}
+        found: dict[str, str] = {}
         for path in [*self.folder.glob("cell.key"), *self.folder.glob("keys/*.key")]:
             lines = [line for line in path.read_text().splitlines() if not line.startswith("-----")]
             found |= {f"{path.name}:{number}": line for number, line in enumerate(lines) if len(line) >= 32}
@@ -206,6 +206,15 @@ async def test_a_guarded_cell_works_and_keeps_its_secrets(tmp_path: Path, how: s
     assert len(cell.leaks(token)) == 1, "this test could not fail"
 
 
+@pytest.mark.parametrize("command", [("nodes",), ("estop",), ("run", "sweeping.toml")])
+def test_a_key_that_others_may_read_stops_every_command(tmp_path: Path, command: tuple[str, ...]) -> None:
+    """Bad input, in one line that says what to do."""
+    cell = Guarded(tmp_path, "shared key")
+    (tmp_path / "cell.key").chmod(0o644)
+    done = cell.petrobot(*command)
+    assert done.returncode == 2 and "chmod 600" in done.stderr and "Traceback" not in done.stderr
+
+
 async def test_without_its_certificate_nobody_gives_orders_to_the_cell(tmp_path: Path) -> None:
     """A run with another cell's certificates reaches no node: exit code 3."""
     cell = Guarded(tmp_path, "certificates")
@@ -217,4 +226,4 @@ async def test_without_its_certificate_nobody_gives_orders_to_the_cell(tmp_path:
         for path in (tmp_path / "own").iterdir():
             path.rename(tmp_path / "keys" / path.name)
         done = await asyncio.to_thread(cell.petrobot, "run", "sweeping.toml", "--no-page", "--quiet")
-    assert done.returncode == 3 and "motion" in done.stderr
+    assert done.returncode == 3 and "motion" in done.stderr and "its certificate is not that of" in done.stderr
