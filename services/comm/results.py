@@ -6,6 +6,7 @@ import math
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import NoneType
 from typing import Any
 
 from services.comm.messages import Outcome
@@ -31,6 +32,7 @@ class Keeping:
 
 _SCALAR = 9
 """Bytes of a number on the wire."""
+_NUMBERS = frozenset((float, int, bool, NoneType))
 
 
 def weight_of(value: Any) -> int:
@@ -39,8 +41,13 @@ def weight_of(value: Any) -> int:
     if kind is str or kind is bytes:
         return len(value) + _SCALAR
     if kind is dict:
-        return _SCALAR + sum(len(key) + weight_of(item) for key, item in value.items())
+        weight = _SCALAR
+        for key, item in value.items():
+            weight += len(key) + (_SCALAR if type(item) in _NUMBERS else weight_of(item))
+        return weight
     if kind is list or kind is tuple:
+        if _NUMBERS.issuperset(map(type, value)):
+            return _SCALAR * (1 + len(value))
         return _SCALAR + sum(map(weight_of, value))
     return _SCALAR
 
