@@ -10,7 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
-from coordinator.cli.loading import add_services_argument, load_task, services_path, task_path, write_json
+from coordinator.cli.loading import (
+    add_services_argument,
+    load_directory,
+    load_task,
+    services_path,
+    task_path,
+    write_json,
+)
 
 if TYPE_CHECKING:
     from coordinator.campaign.conduct import Campaign
@@ -81,7 +88,9 @@ def run(options: argparse.Namespace) -> int:
         if options.resume is not None:
             folder, plan = options.resume, read_manifest(options.resume)
         else:
-            plan = _plan(options, load_task(options.task))
+            task = load_task(options.task)
+            _refuse_unfit(task, options.services)
+            plan = _plan(options, task)
             folder = options.out or Path("campaigns") / f"{Path(plan.task).stem}-{plan.selector}-{plan.seed}"
         campaign = Campaign(folder, plan, shown)
         try:
@@ -116,6 +125,17 @@ def _print_check(check: dict[str, Any] | None) -> None:
         from coordinator.forecast.tables import agreement_text
 
         print(agreement_text(check))
+
+
+def _refuse_unfit(task: Task, services: Path | None) -> None:
+    from coordinator.check import check
+
+    directory = load_directory(services)
+    report = check(task, {action: entry.node for action, entry in directory.actions.items()})
+    faults = [f for f in report.findings if f.severity == "error"]
+    if faults:
+        lines = "\n".join(f"  {f.key}: {f.text}\n    {f.remedy}" for f in faults)
+        raise CommandError(2, f"{task.name} may not run with {directory.source}:\n{lines}")
 
 
 async def _conduct(campaign: Campaign, options: argparse.Namespace) -> None:

@@ -130,6 +130,7 @@ def test_a_killed_campaign_goes_on(tmp_path: Path) -> None:
         (["campaign", *TOY, "--regime", "easy,easy"], "each regime once"),
         (["campaign", *TOY, "--seed", "-1"], "0 or more"),
         (["campaign", *TOY, "--set", "speed=1"], "no parameter 'speed'"),
+        (["campaign", str(TASK)], "may not run with"),
         (["campaign", "x", "--resume", "nowhere"], "holds no campaign"),
         (["campaign", *TOY, "--learned", "nowhere"], "no finished campaign"),
         (["forecast", str(TASK)], "--estimates CAMPAIGN"),
