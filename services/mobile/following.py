@@ -41,11 +41,12 @@ class FeedForward:
     """The line's own curvature where the wheels will have answered, plus PD on the error at the axle.
 
     With kappa = kappa_line + p e + d sin(heading error) the error obeys e'' + d e' + p e = 0 along the way: critically damped for
-    d = 2 sqrt(p), and the way in which it dies out, 1 / sqrt(p) m, does not depend on the speed.
+    d = 2 sqrt(p), for which the wheels' lag asks for a little more. The way in which it dies out, 1 / sqrt(p) m, does not depend
+    on the speed.
     """
 
-    gain: float = 20.0
-    damping: float = 0.9
+    gain: float = 60.0
+    damping: float = 1.1
     lead: float = 0.09
     """s from a set point until the wheels have answered."""
 

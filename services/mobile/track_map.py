@@ -28,7 +28,7 @@ STEP = 0.015
 TURN_STEP = 0.03
 ALIKE = 5
 """Sights that are taken from one place: a standing rover's noise is averaged, then it learns nothing new."""
-REACH = 0.26
+REACH = 0.22
 """m around a place within which points bear on the fit there, the nearer the more."""
 NEEDED = 3
 """Points that a fit needs."""
