@@ -156,8 +156,10 @@ class EstimatesFile:
         with EstimatesFile(other)._open() as db:
             rows = {name: db.execute(f"SELECT * FROM {name}").fetchall() for name in ("tally", "flow", "selector")}
             gone = db.execute("SELECT * FROM forgotten").fetchall()
-        for *_, body in rows["tally"]:
-            _tally(body)
+            for *_, body in rows["tally"]:
+                _tally(body)
+            for *_, body in rows["flow"]:
+                _flow(body)
         with self._writing() as mine:
             _take_later(mine, "tally", rows["tally"], "origin, primitive_task, action, context")
             _take_later(mine, "flow", rows["flow"], "origin, task, transition_name, context")

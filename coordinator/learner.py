@@ -1,7 +1,7 @@
 """The executor's selector that learns: it turns the executor's records into records of learning, and chooses by them.
 
 It stands on two sides of the executor: as its `Selector` it is asked for actions, as an `Observer` it sees everything that
-happens. Its state changes by what it observes alone, never by being asked; so a resumed run, whose recorded steps are shown to
+happens. Times are kept to the microsecond, as journals keep them. Its state changes by what it observes alone, never by being asked; so a resumed run, whose recorded steps are shown to
 it again, has the same state as one that was never interrupted.
 """
 
@@ -203,7 +203,7 @@ class LearningSelector(FirstAlternative):
             if run in self._going:
                 self._going[run].taken_by, self._going[run].taken_at = fired.transition, now
         since = self._waiting.pop(fired.transition, None)
-        waited = None if since is None else now - since
+        waited = None if since is None else round(now - since, 6)
         self._note(Passage(fired.transition, self.context, waited))
 
     def _ended(self, now: float, record: RunRecorded) -> None:
@@ -211,7 +211,7 @@ class LearningSelector(FirstAlternative):
         context = self.context if going.context is None else going.context
         preempted = (going.taken_by or "") if record.cancelled else None
         until = going.taken_at if preempted else now
-        seconds = record.seconds if preempted is None else min(max(0.0, until - going.entered), 1e9)
+        seconds = record.seconds if preempted is None else round(max(0.0, until - going.entered), 6)
         result = going.ended
         outcome = Observation(
             record.status,
@@ -221,7 +221,7 @@ class LearningSelector(FirstAlternative):
             result.cpu_seconds if result is not None else None,
             _numbers(result.values) if result is not None and preempted is None else {},
             preempted,
-            max(0.0, now - going.entered - seconds) if preempted is None else None,
+            round(max(0.0, now - going.entered - seconds), 6) if preempted is None else None,
         )
         end = End(record.primitive_task, record.action, context, outcome)
         if record.deferred:

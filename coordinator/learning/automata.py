@@ -23,8 +23,8 @@ from coordinator.learning.rule import forced, one_hot
 class NikolicFu:
     """The paper's scheme. gamma_k = min(1, c / (k + k0)^exponent), k = 1, 2, ...
 
-    With `mixing` m > 0 the draw is from (1 - eps_k) p + eps_k e, eps_k = min(1, m n / k); each action is chosen `trials`
-    times before that. e explores: a share `even` over all actions alike, the rest over the contenders, those whose J less
+    Each action is chosen `trials` times first. With `mixing` m > 0 the draw is from (1 - eps_k) p + eps_k e, eps_k =
+    min(1, m n / k). e explores: a share `even` over all actions alike, the rest over the contenders, those whose J less
     `focus` standard errors is not above what some action's J plus as many is. The textbook gain has exponent 1, 0 < c <= 1
     and no mixing; docs/learning.md says which parameters converge with probability 1.
     """
@@ -34,7 +34,7 @@ class NikolicFu:
     k0: float = 1.0
     exponent: float = 1.0
     mixing: float = 0.0
-    trials: int = 0
+    trials: int = 5
     even: float = 1.0
     focus: float = 2.0
 
@@ -66,10 +66,13 @@ class NikolicFu:
 
     def probabilities(self, batch: Batch, offered: Mask) -> Array:
         """p with its share of exploration; certain while an action is still owed its first trials."""
-        if not self.mixing:
-            return restricted(batch.p, offered)
-        eps = self.exploration(batch)
-        mixed = restricted((1 - eps) * batch.p + eps * self.explored(batch), offered)
+        mixed = batch.p
+        if self.mixing:
+            eps = self.exploration(batch)
+            mixed = (1 - eps) * batch.p + eps * self.explored(batch)
+        mixed = restricted(mixed, offered)
+        if not self.trials:
+            return mixed
         owed, least = forced(batch, offered, self.trials)
         return np.where(owed[:, None], one_hot(least, batch.n), mixed)
 

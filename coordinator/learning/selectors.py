@@ -24,9 +24,7 @@ from coordinator.task import Executed, Status
 
 RULES: Mapping[str, Callable[[], Rule]] = {
     "nikolic_fu": NikolicFu,
-    "nikolic_fu_fast": lambda: NikolicFu(
-        "nikolic_fu_fast", k0=0.0, exponent=0.5, mixing=20.0, trials=5, even=0.2, focus=1.5
-    ),
+    "nikolic_fu_fast": lambda: NikolicFu("nikolic_fu_fast", k0=0.0, exponent=0.5, mixing=20.0, even=0.2, focus=1.5),
     "tracking": Tracking,
     "reward_inaction": RewardInaction,
     "discretised_pursuit": DiscretisedPursuit,

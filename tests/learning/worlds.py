@@ -74,7 +74,7 @@ def play(
     watch: Callable[[int, Batch, Index], None] | None = None,
 ) -> Played:
     """Play a rule in `seeds` copies of a world; each row has uniform numbers of its own."""
-    batch, n, rows = rule.begin(seeds, world.n), world.n, np.arange(seeds)
+    batch, n = rule.begin(seeds, world.n), world.n
     offered = np.ones((seeds, n), dtype=bool)
     marks = list(checkpoints) or [trials]
     total, regret, p_best = np.zeros(seeds), [], []

@@ -1,0 +1,83 @@
+"""The sorting task in a cell of scripted actions: one node that offers every alternative."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from coordinator.launch import Setting, lockstep_cell
+from coordinator.learner import LearningSelector
+from coordinator.mission import Mission
+from coordinator.partners import FirstAlternative, Store
+from coordinator.task import Task
+from coordinator.taskfile import load
+from services.action import Status
+from services.comm.directory import Directory, parse
+from services.scripted import Line, Scripted
+
+TASK_FILE = Path(__file__).parent / "sorting.toml"
+HEAD = """
+schema = 1
+[nodes.node]
+host = "127.0.0.1"
+port = 7998
+[timers.go]
+node = "node"
+period = 0.04
+[timers.jam]
+node = "node"
+period = 1.24
+[services.memory]
+node = "node"
+"""
+WEIGHT = {"weight": 1.5}
+LINES = {
+    "pick_fast": [
+        Line(Status.ERROR, (0.1, 0.1), cause="slipped"),
+        Line(seconds=(0.1, 0.1), values=WEIGHT),
+        Line(Status.FAILURE, (0.1, 0.1), WEIGHT, "crooked"),
+    ],
+    "pick_slow": [Line(seconds=(0.3, 0.4), values=WEIGHT)],
+    "pick_blind": [Line(Status.ERROR, (0.2, 0.2), cause="missed")],
+    "place_soft": [Line(seconds=(0.2, 0.5), values={"tries": 2, "note": "soft", "sure": True})],
+    "place_hard": [Line(seconds=(0.2, 0.3), values={"tries": 1})],
+}
+
+
+def sorting() -> Task:
+    """The task."""
+    return load(TASK_FILE)
+
+
+def directory(task: Task) -> Directory:
+    """Every alternative on one node."""
+    actions = "".join(
+        f'[actions.{a}]\nrun = "scripted:nothing"\ntask = "{p.name}"\nnode = "node"\n'
+        for p in task.primitive_tasks.values()
+        for a in p.alternatives
+    )
+    return parse(HEAD + actions, Path("services.toml"))
+
+
+def scripts() -> dict[str, Callable[..., Any]]:
+    """What each action does."""
+    return {name: Scripted(lines) for name, lines in LINES.items()}
+
+
+def run(
+    task: Task,
+    selector: LearningSelector | None = None,
+    *,
+    runs: int = 3,
+    seed: int = 1,
+    parameters: Mapping[str, Any] | None = None,
+    store: Store | None = None,
+) -> Mission:
+    """Run to the end, at most an hour of simulated time."""
+    setting = Setting(task, parameters or {}, runs, seed, selector or FirstAlternative())
+    cell, party = lockstep_cell(directory(task), setting, scripts())
+    if store is not None:
+        party.mission.executor.store = store
+    assert cell.run(lambda: party.over, 900_000)
+    return party.mission

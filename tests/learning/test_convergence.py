@@ -1,0 +1,108 @@
+"""Convergence on Bernoulli worlds: the fast variant's floor, the textbook gain beside it, negative controls that stick.
+
+The full study, with figures for every selector, is tests/bench/learning.py; these are its floors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from coordinator.learning.automata import NikolicFu
+from coordinator.learning.rule import Rule
+from coordinator.learning.selectors import RULES
+from coordinator.learning.tracking import Tracking
+from tests.learning.worlds import Played, World, gapped, play
+
+SEEDS = 1000
+
+
+def free(gap: float, best: float = 0.9) -> World:
+    """Reliability alone counts."""
+    return replace(gapped(gap, best), cost=(0.0,) * 4)
+
+
+def converged(rule: Rule, world: World, trials: int = 500, seeds: int = SEEDS) -> float:
+    """Share of seeds with p >= 0.95 on the optimum."""
+    played = play(rule, world, trials, seeds, np.random.default_rng(1))
+    return float(np.mean(played.p_best[-1] >= 0.95))
+
+
+@pytest.mark.parametrize("gap", [0.4, 0.3, 0.2])
+@pytest.mark.parametrize("best", [0.95, 0.9, 0.8, 0.6])
+def test_the_fast_variant_finds_the_optimum_in_500_trials(gap: float, best: float) -> None:
+    """p >= 0.95 in at least 99 % of 1,000 seeds at gaps from 0.2 on with 4 actions, whatever the best reliability."""
+    assert converged(RULES["nikolic_fu_fast"](), free(gap, best)) >= 0.99
+
+
+def test_costs_with_scatter_are_found_too() -> None:
+    """J differs by cost alone (gap 0.25), each run's cost scatters by 32 %."""
+    world = World("costs", (0.9,) * 4, (4.0, 4.0, 4.0, 3.0))
+    assert converged(RULES["nikolic_fu_fast"](), world) >= 0.99
+
+
+def test_the_textbook_gain_needs_longer_and_gets_there() -> None:
+    """Its order of actions is right ever more often; p follows slowly."""
+    shares = [converged(RULES["nikolic_fu"](), free(0.4), trials, 300) for trials in (100, 500, 2500)]
+    assert shares == sorted(shares)
+    assert shares[0] < 0.2
+    assert shares[-1] > 0.95
+
+
+@pytest.mark.parametrize(
+    "rule",
+    [NikolicFu("k^-0.6", k0=1.0, exponent=0.6), NikolicFu("c = 2", c=2.0, k0=2.0)],
+    ids=["k^-0.6", "c = 2"],
+)
+def test_gains_outside_the_conditions_stick(rule: NikolicFu) -> None:
+    """Negative controls: many seeds end with all probability on a wrong action, and three times the trials change next to nothing."""
+    played = play(rule, free(0.2, 0.6), 3000, 300, np.random.default_rng(1), (1000, 3000))
+    stuck = played.p_best < 0.01
+    assert stuck[0].mean() > 0.1
+    assert np.mean(stuck[1][stuck[0]]) > 0.9
+
+
+def test_the_conditions_tell_these_gains_apart() -> None:
+    """(i) the gains sum to infinity, (ii) so do the products of 1 - gamma: partial sums to 1e6 grow or stop."""
+    k = np.arange(1.0, 1e6)
+
+    def sums(rule: NikolicFu) -> tuple[float, float]:
+        gain = rule.gain(k)
+        products = np.cumprod(1 - gain)
+        return float(gain[len(k) // 10 :].sum()), float(products[len(k) // 10 :].sum())
+
+    textbook, fast_gain, double = NikolicFu(), NikolicFu(k0=1.0, exponent=0.6), NikolicFu(c=2.0, k0=2.0)
+    assert sums(textbook)[0] > 1
+    assert sums(textbook)[1] > 1
+    assert sums(fast_gain)[1] < 1e-12
+    assert sums(double)[1] < 1e-3
+
+
+@pytest.mark.parametrize("name", ["nikolic_fu_fast", "thompson", "ucb1", "discretised_pursuit"])
+def test_equal_actions_cost_no_regret(name: str) -> None:
+    """Where all are equal, whoever wins is right: the paper's claim that slow learning is then harmless."""
+    played = play(RULES[name](), free(0.0), 300, 50, np.random.default_rng(2))
+    assert np.all(played.regret == 0.0)
+    assert np.all(played.optimal == 1.0)
+
+
+def changing(rule: Rule) -> Played:
+    """The best and the worst action change places after 1,000 of 2,000 trials."""
+    world = World("changing", (0.5, 0.5, 0.5, 0.9), (0.0,) * 4, 1000, (0.9, 0.5, 0.5, 0.5))
+    return play(rule, world, 2000, 300, np.random.default_rng(3), (1000, 2000))
+
+
+def test_tracking_follows_a_world_that_changes() -> None:
+    """Most of the last hundred choices are the new best one; the converging scheme is still at the old one."""
+    following, converging = changing(Tracking()), changing(RULES["nikolic_fu_fast"]())
+    assert following.optimal.mean() > 0.85
+    assert converging.optimal.mean() < 0.5
+    assert np.median(following.batch.own["restarts"]) >= 1
+
+
+def test_tracking_seldom_sees_a_change_where_there_is_none() -> None:
+    """False alarms in 2,000 trials of a world that stays."""
+    played = play(Tracking(), free(0.2), 2000, 300, np.random.default_rng(4))
+    assert np.mean(played.batch.own["restarts"] > 0) < 0.1

@@ -1,0 +1,205 @@
+"""Tallies: what each kind of end changes, merging, corrections, intervals and quantiles."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from coordinator.learning.estimate import Observation, Tally, merge
+from coordinator.learning.intervals import clopper_pearson, wilson
+from coordinator.learning.moments import Moments
+from coordinator.learning.sample import SIZE, Sample, quantile
+from coordinator.task import Executed, Status
+from tests.learning.conftest import COUNTED, OBSERVATIONS, tally_of
+
+NUMBERS = st.lists(st.floats(-1e3, 1e3), max_size=30)
+
+
+def of(numbers: list[float]) -> Moments:
+    """Moments of some numbers."""
+    out = Moments()
+    for x in numbers:
+        out = out.adding(x)
+    return out
+
+
+def close(one: Moments, other: Moments) -> bool:
+    """Equal up to rounding."""
+    return one.n == other.n and np.allclose([one.mean, one.variance], [other.mean, other.variance], atol=1e-6)
+
+
+@given(NUMBERS, NUMBERS)
+def test_moments_are_those_of_numpy_and_merge(one: list[float], other: list[float]) -> None:
+    """Mean and variance by themselves, and of two streams together."""
+    both = of(one).merged(of(other))
+    assert close(both, of(one + other))
+    if len(one + other) > 1:
+        assert both.mean == pytest.approx(np.mean(one + other), abs=1e-9)
+        assert both.variance == pytest.approx(np.var(one + other, ddof=1), abs=1e-6)
+        assert (both.low, both.high) == (min(one + other), max(one + other))
+
+
+@given(NUMBERS, st.floats(-1e3, 1e3))
+def test_a_number_can_be_taken_back(numbers: list[float], x: float) -> None:
+    """Adding and removing leaves what was."""
+    assert close(of(numbers).adding(x).without(x), of(numbers))
+
+
+def test_moments_survive_large_offsets() -> None:
+    """The variance of 1e9 + {0, 1, 2} is 1: no cancellation."""
+    assert of([1e9, 1e9 + 1, 1e9 + 2]).variance == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("seen", "runs", "reliability", "availability", "censored"),
+    [
+        (Observation(Status.SUCCESS, 1.0), 1, 1.0, 1.0, 0),
+        (Observation(Status.FAILURE, 1.0, "late"), 1, 0.0, 1.0, 0),
+        (Observation(Status.ERROR, 1.0, "lost"), 1, 0.0, 1.0, 0),
+        (Observation(Status.ERROR, 1.0, "lost", Executed.UNKNOWN), 1, 0.0, 1.0, 0),
+        (Observation(Status.ERROR, 0.0, "unreachable", Executed.NO), 0, math.nan, 0.0, 0),
+        (Observation(None, 0.4, preempted_by="ball_lost"), 0, math.nan, 1.0, 1),
+        (Observation(Status.SUCCESS, 0.4, preempted_by="caught"), 1, 1.0, 1.0, 0),
+        (Observation(None, 0.0, executed=Executed.NO, preempted_by="caught"), 0, math.nan, 1.0, 0),
+    ],
+    ids=["success", "failure", "error", "unknown", "never executed", "censored", "preempted success", "never began"],
+)
+def test_what_an_end_changes(
+    seen: Observation, runs: int, reliability: float, availability: float, censored: int
+) -> None:
+    """R counts executed, uncensored runs; what never executed lowers the availability alone."""
+    tally = Tally().adding(seen)
+    assert tally.runs == runs
+    assert tally.reliability == pytest.approx(reliability, nan_ok=True)
+    assert tally.availability == availability
+    assert tally.censored == censored
+    assert tally.unknown == (seen.executed is Executed.UNKNOWN)
+    assert tally.exposure == (0.0 if seen.executed is Executed.NO else seen.seconds)
+
+
+@given(OBSERVATIONS, OBSERVATIONS, OBSERVATIONS)
+def test_tallies_merge_like_sets_of_runs(a: list[Observation], b: list[Observation], c: list[Observation]) -> None:
+    """Commutative, associative, and what one counter would have counted (up to rounding of the sums)."""
+    x, y, z = tally_of(a, "a"), tally_of(b, "b"), tally_of(c, "c")
+    assert merge(x, y).counts == merge(y, x).counts
+    assert merge(x, y).sample == merge(y, x).sample
+    left, right = merge(merge(x, y), z), merge(x, merge(y, z))
+    whole = tally_of(a + b + c)
+    for one in (left, right):
+        assert one.counts == whole.counts
+        assert one.not_executed == whole.not_executed
+        assert (one.changes, one.unknown, one.censored) == (whole.changes, whole.unknown, whole.censored)
+        assert set(one.durations) == set(whole.durations)
+        assert all(close(one.durations[e], whole.durations[e]) for e in whole.durations)
+        assert close(one.cpu, whole.cpu)
+        assert all(close(one.values[v], whole.values[v]) for v in whole.values)
+    assert left.sample == right.sample
+
+
+@given(OBSERVATIONS)
+def test_a_tally_is_plain_data_and_back(seen: list[Observation]) -> None:
+    """Through JSON, exactly; and its keys are sorted, so equal tallies have equal texts."""
+    tally = tally_of(seen)
+    text = json.dumps(tally.to_plain())
+    assert Tally.of_plain(json.loads(text)) == tally
+    assert list(tally.counts) == sorted(tally.counts)
+    assert list(tally.durations) == sorted(tally.durations)
+
+
+@given(OBSERVATIONS, COUNTED, st.sampled_from(Status))
+def test_a_deferred_verdict_changes_r_once(seen: list[Observation], deferred: Observation, status: Status) -> None:
+    """The corrected tally counts as if the status had been so from the beginning."""
+    assert deferred.status is not None
+    corrected = tally_of([*seen, deferred]).correcting(deferred, status, "seen later")
+    expected = tally_of(
+        [*seen, Observation(status, deferred.seconds, "seen later", preempted_by=deferred.preempted_by)]
+    )
+    assert corrected.counts == expected.counts
+    assert {e: m.n for e, m in corrected.durations.items()} == {e: m.n for e, m in expected.durations.items()}
+    assert corrected.corrected == (status is not deferred.status)
+    assert corrected.runs == expected.runs
+
+
+def test_a_verdict_on_nothing_is_refused() -> None:
+    """No run of that status and cause was counted."""
+    with pytest.raises(KeyError):
+        Tally().correcting(Observation(Status.SUCCESS, 1.0), Status.FAILURE)
+    with pytest.raises(KeyError):
+        Tally().correcting(Observation(None, 1.0), Status.FAILURE)
+
+
+@pytest.mark.parametrize(
+    ("measure", "mean"), [("wall", 2.0), ("cpu", 0.2), ("count", 1.0), ("value:images", 5.0), ("value:energy", 0.0)]
+)
+def test_cost_by_measure(measure: str, mean: float) -> None:
+    """Each declared measure over the counted runs; an unknown value has no numbers."""
+    seen = [
+        Observation(Status.SUCCESS, 1.0, cpu_seconds=0.1, values={"images": 4.0}),
+        Observation(Status.FAILURE, 3.0, "late", cpu_seconds=0.3, values={"images": 6.0}),
+        Observation(None, 50.0, preempted_by="gone"),
+    ]
+    assert tally_of(seen).cost(measure).mean == pytest.approx(mean)
+    with pytest.raises(ValueError, match="no cost measure"):
+        tally_of(seen).cost("pictures")
+
+
+@given(st.integers(0, 60), st.integers(0, 60), st.sampled_from([0.8, 0.9, 0.95]))
+def test_intervals_are_the_known_ones(successes: int, others: int, level: float) -> None:
+    """Wilson and Clopper-Pearson as scipy has them; the exact interval is never the shorter at its ends' coverage."""
+    n = successes + others
+    if n == 0:
+        assert wilson(0, 0) == clopper_pearson(0, 0) == (0.0, 1.0)
+        return
+    known = stats.binomtest(successes, n)
+    for made, method in ((wilson, "wilson"), (clopper_pearson, "exact")):
+        low, high = made(successes, n, level)
+        expected = known.proportion_ci(level, method)
+        assert low == pytest.approx(expected.low, abs=1e-9)
+        assert high == pytest.approx(expected.high, abs=1e-9)
+
+
+@pytest.mark.parametrize("p", [0.05, 0.5, 0.93])
+def test_exact_intervals_cover(p: float) -> None:
+    """Over all outcomes of 40 runs, the exact interval covers p with at least 95 %."""
+    weight = stats.binom.pmf(np.arange(41), 40, p)
+    covered = [low <= p <= high for low, high in (clopper_pearson(i, 40) for i in range(41))]
+    exact = float(weight @ np.array(covered))
+    assert exact >= 0.95
+
+
+@given(st.lists(st.floats(0, 100), min_size=1, max_size=60), st.floats(0, 1))
+def test_quantiles_interpolate(numbers: list[float], q: float) -> None:
+    """As numpy's."""
+    assert quantile(numbers, q) == pytest.approx(float(np.quantile(numbers, q)), abs=1e-9)
+
+
+def test_the_sample_stays_bounded_and_uniform() -> None:
+    """Of 5,000 durations 0 to 1, `SIZE` are kept, and their law is uniform (Kolmogorov-Smirnov at 1e-3)."""
+    sample = Sample()
+    for i in range(5000):
+        sample = sample.adding(f"x/{i}", i / 5000, None, "success")
+    assert len(sample.kept) == SIZE
+    assert stats.kstest(sample.seconds(), "uniform").pvalue > 1e-3
+
+
+@given(st.lists(st.lists(st.integers(0, 10**6), max_size=300), min_size=2, max_size=4))
+def test_samples_merge_in_any_order(parts: list[list[int]]) -> None:
+    """Merging is idempotent, commutative and associative, and equals the sample of all runs."""
+    made = []
+    for i, part in enumerate(parts):
+        sample = Sample()
+        for j, x in enumerate(part):
+            sample = sample.adding(f"{i}/{j}", float(x), None, "success")
+        made.append(sample)
+    forward, backward = Sample(), Sample()
+    for sample in made:
+        forward = forward.merged(sample).merged(sample)
+    for sample in reversed(made):
+        backward = sample.merged(backward)
+    assert forward == backward

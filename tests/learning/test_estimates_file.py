@@ -1,0 +1,241 @@
+"""The estimates file: what survives, what merges, what stays forgotten, and how a bad file is refused."""
+
+from __future__ import annotations
+
+import sqlite3
+from itertools import permutations
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from coordinator.estimates_file import EstimatesError, EstimatesFile, Kept
+from coordinator.learning.estimate import Key, Observation
+from coordinator.learning.learning import Estimates
+from coordinator.learning.passage import Flow, PassageKey
+from coordinator.learning.selectors import make
+from coordinator.task import Status
+from tests.learning.conftest import OBSERVATIONS, tally_of
+
+KEY = Key("pick", "pick_fast", "regime=A")
+OTHER = Key("place", "place_soft")
+
+
+def gained(good: int, key: Key = KEY, salt: str = "") -> Estimates:
+    """So many successes of one action, and as many firings."""
+    tally = tally_of([Observation(Status.SUCCESS, 0.1 * (i + 1), cpu_seconds=0.01) for i in range(good)], salt)
+    flow = Flow()
+    for _ in range(good):
+        flow = flow.adding(0.02)
+    return Estimates({key: tally}, {PassageKey("sorting", "begin", "regime=A"): flow})
+
+
+def file_of(path: Path, good: int, key: Key = KEY) -> EstimatesFile:
+    """A file with an origin of its own."""
+    file = EstimatesFile(path)
+    file.add(gained(good, key, path.name), {})
+    return file
+
+
+def known(file: EstimatesFile) -> tuple[Any, Any]:
+    """What can be compared of a file's estimates: all but the order of sums."""
+    kept = file.read()
+    tallies = {k: (t.counts, t.changes, t.sample) for k, t in kept.estimates.tallies.items()}
+    return tallies, {k: f.fired for k, f in kept.estimates.flows.items()}
+
+
+def test_what_was_added_is_there_again(tmp_path: Path) -> None:
+    """Sums of several sessions, selectors' states, the generation; a file that is not there holds nothing."""
+    path = tmp_path / "deep" / "learned.db"
+    assert EstimatesFile(path).read() == Kept()
+    selector = make("ucb1", ("pick_fast", "pick_slow"))
+    selector.update("regime=A", "pick_fast", Observation(Status.SUCCESS, 1.0))
+    for session in range(3):
+        EstimatesFile(path).add(gained(4, salt=str(session)), {"pick": selector.state()})
+    kept = EstimatesFile(path).read()
+    assert kept.generation == 3
+    assert kept.estimates.tally(KEY).runs == 12
+    assert len(kept.estimates.tally(KEY).sample.kept) == 12
+    assert kept.estimates.flows[PassageKey("sorting", "begin", "regime=A")].waits.n == 12
+    assert kept.states("ucb1") == {"pick": selector.state()}
+    assert kept.states("thompson") == {}
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seen=OBSERVATIONS.filter(len))
+def test_tallies_come_back_exactly(seen: list[Observation], tmp_path: Path) -> None:
+    """Whatever was observed."""
+    path = tmp_path / "exact.db"
+    path.unlink(missing_ok=True)
+    tally = tally_of(seen)
+    EstimatesFile(path).add(Estimates({KEY: tally}), {})
+    assert EstimatesFile(path).read().estimates.tally(KEY) == tally
+
+
+def test_merging_counts_every_run_once(tmp_path: Path) -> None:
+    """In any order and however often: three machines' files all come to the same."""
+    seen = []
+    for order in permutations(range(3)):
+        folder = tmp_path / "".join(map(str, order))
+        files = [file_of(folder / f"{i}.db", 3 + i, KEY if i else OTHER) for i in range(3)]
+        first = files[order[0]]
+        for i in (*order[1:], order[1], order[2]):
+            first.merge(files[i].path)
+        files[order[1]].merge(first.path)
+        first.merge(files[order[1]].path)
+        tallies, flows = known(first)
+        assert known(files[order[1]]) == (tallies, flows)
+        seen.append({k: (counts, changes) for k, (counts, changes, _) in tallies.items()})
+        assert sum(flows.values()) == 12
+    assert all(one == seen[0] for one in seen)
+    assert seen[0][KEY][1] == 9
+
+
+def test_a_merge_takes_the_later_version(tmp_path: Path) -> None:
+    """A copy that is older than what is known changes nothing; a newer one replaces it."""
+    one, other = file_of(tmp_path / "one.db", 5), EstimatesFile(tmp_path / "other.db")
+    other.merge(one.path)
+    one.add(gained(2, salt="more"), {})
+    other.merge(one.path)
+    assert other.read().estimates.tally(KEY).runs == 7
+    one_again = EstimatesFile(tmp_path / "third.db")
+    one_again.merge(other.path)
+    one_again.merge(one.path)
+    assert one_again.read().estimates.tally(KEY).runs == 7
+
+
+def test_the_selector_that_learned_from_more_is_kept(tmp_path: Path) -> None:
+    """Probabilities cannot be summed."""
+    states = []
+    for name, trials in (("few.db", 3), ("many.db", 30)):
+        selector = make("nikolic_fu", ("pick_fast", "pick_slow"))
+        for _ in range(trials):
+            selector.update("", "pick_slow", Observation(Status.SUCCESS, 1.0))
+        states.append(selector.state())
+        EstimatesFile(tmp_path / name).add(Estimates(), {"pick": selector.state()})
+    few, many = (EstimatesFile(tmp_path / name) for name in ("few.db", "many.db"))
+    many.merge(few.path)
+    assert many.read().states("nikolic_fu")["pick"] == states[1]
+    few.merge(many.path)
+    assert few.read().states("nikolic_fu")["pick"] == states[1]
+
+
+def test_what_was_reset_stays_forgotten(tmp_path: Path) -> None:
+    """Also when an old copy is merged again; what comes after the reset counts."""
+    one, copy = file_of(tmp_path / "one.db", 5), EstimatesFile(tmp_path / "copy.db")
+    one.add(gained(3, OTHER), {})
+    copy.merge(one.path)
+    one.reset("pick")
+    one.add(gained(2, salt="after"), {})
+    one.merge(copy.path)
+    kept = one.read().estimates
+    assert (kept.tally(KEY).runs, kept.tally(OTHER).runs) == (2, 3)
+    one.reset()
+    one.merge(copy.path)
+    assert not one.read().estimates.tallies
+    assert not one.read().estimates.flows
+
+
+def test_selectors_alone_can_be_reset(tmp_path: Path) -> None:
+    """The estimates stay: they are about the actions, not about who chose."""
+    file = EstimatesFile(tmp_path / "one.db")
+    file.add(gained(5), {"pick": make("ucb1", ("pick_fast",)).state()})
+    file.reset("pick", selectors_only=True)
+    assert file.read().estimates.tally(KEY).runs == 5
+    assert not file.read().selectors
+
+
+def test_two_sessions_at_once_lose_nothing(tmp_path: Path) -> None:
+    """Both read the file, both add what they gained: the sums are added within the file, not written over."""
+    file = file_of(tmp_path / "one.db", 1)
+    sessions = [EstimatesFile(tmp_path / "one.db") for _ in range(2)]
+    for session in sessions:
+        session.read()
+    for i, session in enumerate(sessions):
+        session.add(gained(4, salt=str(i)), {})
+    assert file.read().estimates.tally(KEY).runs == 9
+
+
+def test_a_reader_is_not_disturbed_by_a_writer(tmp_path: Path) -> None:
+    """WAL: while a transaction is open, the state before it is read."""
+    file = file_of(tmp_path / "one.db", 3)
+    with sqlite3.connect(file.path, isolation_level=None) as db:
+        assert db.execute("PRAGMA journal_mode").fetchone()[0] == "wal"
+        db.execute("BEGIN IMMEDIATE")
+        db.execute("DELETE FROM tally")
+        assert file.read().estimates.tally(KEY).runs == 3
+        db.execute("ROLLBACK")
+    db.close()
+
+
+def test_records_of_a_mission_are_remembered(tmp_path: Path) -> None:
+    """So that a run that was saved, resumed and saved again counts once."""
+    file = EstimatesFile(tmp_path / "one.db")
+    assert file.records_of("m") == 0
+    file.add(gained(2), {}, "m", 17)
+    assert (file.records_of("m"), file.records_of("n")) == (17, 0)
+
+
+def written(path: Path, statements: str) -> Path:
+    """A database made by hand."""
+    db = sqlite3.connect(path)
+    db.executescript(statements)
+    db.close()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda p: p.write_bytes(b"no database at all, but long enough to be looked at" * 9), "not a database"),
+        (lambda p: written(p, "CREATE TABLE songs(name)"), "no estimates file"),
+        (lambda p: file_of(p, 2) and written(p, "PRAGMA user_version = 99"), "schema 99.*upgrade"),
+        (lambda p: file_of(p, 2) and written(p, "PRAGMA user_version = 0"), "schema 0.*new file"),
+        (lambda p: file_of(p, 2) and written(p, "UPDATE tally SET body = '{}'"), "do not fit"),
+        (lambda p: file_of(p, 2) and written(p, "UPDATE tally SET body = 'x'"), "do not fit"),
+        (lambda p: file_of(p, 2) and written(p, "DROP TABLE tally"), "no such table"),
+        (lambda p: p.mkdir(), "unable to open"),
+    ],
+    ids=["text", "foreign", "newer", "older", "empty body", "torn body", "no table", "folder"],
+)
+def test_a_bad_file_gives_one_clear_error(tmp_path: Path, spoil: Any, said: str) -> None:
+    """File, what is wrong, what to do; and it is left as it was."""
+    path = tmp_path / "learned.db"
+    spoil(path)
+    with pytest.raises(EstimatesError, match=said) as fault:
+        EstimatesFile(path).read()
+    assert str(path) in str(fault.value)
+    with pytest.raises(EstimatesError):
+        EstimatesFile(tmp_path / "good.db").merge(path)
+
+
+def test_merging_from_nowhere_is_refused(tmp_path: Path) -> None:
+    """And makes no file."""
+    with pytest.raises(EstimatesError, match="no such file"):
+        EstimatesFile(tmp_path / "one.db").merge(tmp_path / "two.db")
+    assert not (tmp_path / "one.db").exists()
+
+
+@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(steps=st.lists(st.tuples(st.integers(0, 2), st.sampled_from("amM"), st.integers(1, 3)), max_size=12))
+def test_files_that_met_agree(steps: list[tuple[int, str, int]], tmp_path: Path) -> None:
+    """Whatever was added where and merged whither: after all have met, all know every run exactly once."""
+    folder = tmp_path / "crdt"
+    for old in folder.glob("*") if folder.exists() else ():
+        old.unlink()
+    files = [EstimatesFile(folder / f"{i}.db", f"origin{i}") for i in range(3)]
+    added = 3
+    for i, file in enumerate(files):
+        file.add(gained(1, salt=f"begin{i}"), {})
+    for number, (i, what, n) in enumerate(steps):
+        if what == "a":
+            files[i].add(gained(n, salt=str(number)), {})
+            added += n
+        else:
+            files[i].merge(files[(i + n) % 3].path)
+    for _ in range(2):
+        for i in range(3):
+            files[i].merge(files[(i + 1) % 3].path)
+    assert {f.read().estimates.tally(KEY).runs for f in files} == {added}

@@ -1,0 +1,197 @@
+"""`run --learn` and `learned` as a user meets them: twice in a row, frozen, merged; and nothing touched without --learn."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from coordinator.cli import main
+from coordinator.estimates_file import EstimatesFile
+from coordinator.learning.estimate import Key
+from coordinator.learning_session import LearningSession, LearningSetting, session_of
+from tests.learning.cell import TASK_FILE, directory, run, sorting
+
+SERVICES = """
+schema = 1
+[nodes.node]
+host = "127.0.0.1"
+port = 7998
+[timers.go]
+node = "node"
+period = 0.04
+[timers.jam]
+node = "node"
+period = 1.24
+[services.memory]
+node = "node"
+"""
+MOCK = """
+schema = 1
+[actions.pick_fast]
+status = "error"
+cause = "slipped"
+seconds = 0.1
+[actions.pick_slow]
+seconds = [0.2, 0.3]
+values = { weight = 1.5 }
+[actions.pick_blind]
+status = "error"
+cause = "missed"
+seconds = 0.2
+[actions.place_soft]
+seconds = 0.2
+values = { tries = 2 }
+[actions.place_hard]
+seconds = 0.2
+values = { tries = 1 }
+"""
+
+
+@pytest.fixture
+def cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with services.toml and scripted actions for the sorting task."""
+    actions = "".join(
+        f'[actions.{a}]\nrun = "math:sqrt"\ntask = "{p.name}"\nnode = "node"\n'
+        for p in sorting().primitive_tasks.values()
+        for a in p.alternatives
+    )
+    (tmp_path / "services.toml").write_text(SERVICES + actions, encoding="utf-8")
+    (tmp_path / "mock.toml").write_text(MOCK, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def petrobot(*more: str, runs: int = 6) -> tuple[int, dict[str, Any]]:
+    """Run the sorting task in lock step; the result without its wall-clock time."""
+    given = ["--mode", "lockstep", "--runs", str(runs), "--mock", "mock.toml", "--json", "out.json", "--quiet"]
+    code = main(["run", str(TASK_FILE), *given, *more])
+    result: dict[str, Any] = json.loads(Path("out.json").read_text(encoding="utf-8"))
+    del result["wall_s"]
+    return code, result
+
+
+def test_learning_goes_on_where_it_stood(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Two runs in a row add up; a fresh file and the same seed give the same again."""
+    learn = ("--learn", "learned.db", "--selector", "nikolic_fu_fast")
+    code, first = petrobot(*learn)
+    assert code == 0
+    assert first["learned"]["context"] == "regime=A"
+    code, second = petrobot(*learn)
+    runs = first["learned"]["runs_counted"] + second["learned"]["runs_counted"]
+    kept = EstimatesFile(cell / "learned.db").read()
+    assert sum(t.runs + t.censored for t in kept.estimates.tallies.values()) == runs > 12
+    assert kept.generation == 2
+    assert kept.states("nikolic_fu_fast")["pick"]["learners"]["regime=A"]["k"] == 12
+    _, again = petrobot("--learn", "other.db", "--selector", "nikolic_fu_fast")
+    again["learned"]["file"] = first["learned"]["file"]
+    assert again == first
+    assert main(["learned", "show", "learned.db", "--target", "0.9", "--json", "shown.json"]) == 0
+    shown = json.loads(Path("shown.json").read_text(encoding="utf-8"))["primitive_tasks"]
+    assert {row["action"] for row in shown["pick"]["actions"]} == {"pick_fast", "pick_slow", "pick_blind"}
+    assert shown["pick"]["best"] in (None, "pick_slow")
+    assert "nikolic_fu_fast regime=A" in capsys.readouterr().out.replace("\n", " ")
+
+
+def test_it_learns_the_only_way_that_works(cell: Path) -> None:
+    """Of three ways to pick, one succeeds: after 150 runs it has nearly all probability, and frozen it is always chosen."""
+    _, result = petrobot("--learn", "learned.db", runs=150)
+    assert result["learned"]["probabilities"]["pick"]["pick_slow"] > 0.9
+    before = (cell / "learned.db").read_bytes()
+    _, frozen = petrobot("--learn", "learned.db", "--frozen", runs=3)
+    assert frozen["learned"]["runs_counted"] == 0
+    assert frozen["firings"] == 3 * 3
+    assert (cell / "learned.db").read_bytes() == before
+
+
+def test_without_learn_nothing_is_read_or_changed(cell: Path) -> None:
+    """The same result whether a file lies there or not, and the file is left alone."""
+    _, clean = petrobot()
+    petrobot("--learn", "learned.db", runs=20)
+    files = {p: p.read_bytes() for p in cell.iterdir() if p.name != "out.json"}
+    _, after = petrobot()
+    assert after == clean
+    assert "learned" not in after
+    assert {p: p.read_bytes() for p in cell.iterdir() if p.name != "out.json"} == files
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--selector", "ucb1"], "--selector needs --learn"),
+        (["--target", "0.9"], "--target needs --learn"),
+        (["--frozen"], "--frozen needs --learn"),
+        (["--learn", "none.db", "--frozen"], "learn first"),
+        (["--learn", "mock.toml"], "not a database"),
+        (["--learn", "learned.db", "--context", "speed"], "no parameter or variable 'speed'"),
+        (["--learn", "learned.db", "--selector", "greedy"], "invalid choice"),
+        (["--learn", "learned.db", "--target", "7"], "no reliability"),
+    ],
+)
+def test_bad_input_is_refused(cell: Path, arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Exit code 2 and one line, before anything runs or is written."""
+    given = ["run", str(TASK_FILE), "--mode", "lockstep", "--mock", "mock.toml", "--quiet", *arguments]
+    assert main(given) == 2
+    assert said in capsys.readouterr().err
+    assert not (cell / "learned.db").exists()
+
+
+def test_verbs_of_learned(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Merge adds, freeze holds the selectors, reset forgets; unknown names are refused."""
+    petrobot("--learn", "one.db", runs=8)
+    petrobot("--learn", "two.db", "--seed", "9", runs=8)
+    frozen_at = json.dumps(EstimatesFile(cell / "one.db").read().states("nikolic_fu_fast")["pick"]["learners"])
+    assert main(["learned", "freeze", "one.db", "pick"]) == 0
+    petrobot("--learn", "one.db", runs=4)
+    states = EstimatesFile(cell / "one.db").read().states("nikolic_fu_fast")
+    assert json.dumps(states["pick"]["learners"]) == frozen_at
+    assert states["pick"]["frozen"]
+    assert not states["place"]["frozen"]
+    assert main(["learned", "thaw", "one.db"]) == 0
+    assert main(["learned", "merge", "one.db", "two.db"]) == 0
+    runs = sum(t.runs for t in EstimatesFile(cell / "one.db").read().estimates.of("pick")["pick_slow"].values())
+    assert main(["learned", "merge", "one.db", "two.db", "two.db"]) == 0
+    again = sum(t.runs for t in EstimatesFile(cell / "one.db").read().estimates.of("pick")["pick_slow"].values())
+    assert again == runs
+    assert main(["learned", "reset", "one.db", "pick"]) == 0
+    assert not EstimatesFile(cell / "one.db").read().estimates.of("pick")
+    capsys.readouterr()
+    for arguments, said in (
+        (["show", "none.db"], "no such file"),
+        (["merge", "one.db"], "what?"),
+        (["merge", "one.db", "none.db"], "no such file"),
+        (["reset", "one.db", "fly"], "no primitive task 'fly'"),
+        (["show", "one.db", "--cost", "pictures"], "no cost measure"),
+    ):
+        assert main(["learned", *arguments]) == 2
+        assert said in capsys.readouterr().err
+
+
+def test_a_run_that_was_saved_and_resumed_counts_once(tmp_path: Path) -> None:
+    """The session of a recorded run begins as that run began, and adds only what was not saved before."""
+    task, path = sorting(), tmp_path / "learned.db"
+    one = LearningSession(task, LearningSetting(path), seed=5)
+    header = {"seed": 5, "learning": json.loads(json.dumps(one.beginning()))}
+    run(task, one.selector, runs=9, seed=5)
+    half = len(one.selector.records) // 2
+    interrupted = session_of(task, header)
+    assert interrupted is not None
+    for record in one.selector.records[:half]:
+        interrupted.selector.records.append(record)
+        interrupted.learning.apply(record)
+    interrupted.save("m")
+    resumed = session_of(task, header)
+    assert resumed is not None
+    for record in one.selector.records:
+        resumed.selector.records.append(record)
+        resumed.learning.apply(record)
+    resumed.save("m")
+    kept = EstimatesFile(path).read()
+    for key, tally in one.learning.gained.tallies.items():
+        assert kept.estimates.tally(key).counts == tally.counts
+    assert kept.states("nikolic_fu_fast") == one.learning.state()
+    assert directory(task).actions
+    assert session_of(task, {"seed": 5}) is None
+    assert Key("pick", "pick_slow", "regime=A") in kept.estimates.tallies

@@ -1,0 +1,190 @@
+"""The selector that learns, on the executor: what it records, by which contexts, and that replay derives the same state."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from coordinator.engine import Engine, State
+from coordinator.engine.instructions import Corrected, RunRecorded, StartRun
+from coordinator.journal import JournalWriter, read_journal
+from coordinator.launch import with_runs
+from coordinator.learner import ContextError, Contexts, LearningSelector, usual_contexts
+from coordinator.learning.estimate import Key
+from coordinator.learning.learning import Learning
+from coordinator.learning.records import Choice, End, Passage, of_plain, to_plain
+from coordinator.learning.selectors import RULES
+from coordinator.recording import JournalStore, replay
+from coordinator.task import Executed, Status, Task
+from tests.learning.cell import directory, run, sorting
+
+
+@pytest.fixture(scope="module")
+def task() -> Task:
+    """The sorting task."""
+    return sorting()
+
+
+def learner(task: Task, name: str = "nikolic_fu_fast", **more: Any) -> LearningSelector:
+    """A selector that knows nothing."""
+    return LearningSelector(Learning(task, name), **more)
+
+
+def test_every_end_and_choice_is_recorded(task: Task) -> None:
+    """Tallies count what the mission's own tally counts; records are plain data and back."""
+    selector = learner(task, seed=1)
+    mission = run(task, selector, runs=12)
+    recorded = Counter((r.primitive_task, r.action, r.status) for r in mission.tally.runs)
+    tallies = selector.learning.estimates.tallies
+    assert sum(recorded.values()) > 15
+    for key, tally in tallies.items():
+        assert key.context == "regime=A"
+        for status in Status:
+            assert tally.count(status) == recorded[key.primitive_task, key.action, status]
+        assert tally.censored == recorded[key.primitive_task, key.action, None]
+    choices = [r for r in selector.records if isinstance(r, Choice)]
+    assert len(choices) == len([r for r in selector.records if isinstance(r, End)])
+    assert [of_plain(json.loads(json.dumps(to_plain(r)))) for r in selector.records] == selector.records
+
+
+def test_costs_durations_waits_and_values(task: Task) -> None:
+    """Seconds as the node says, what the token waited beyond, numbers of the result, and the wait for the pulse."""
+    selector = learner(task, "round_robin", seed=1)
+    run(task, selector, runs=12)
+    known = selector.learning.estimates
+    slow = known.tally(Key("pick", "pick_slow", "regime=A"))
+    assert 0.3 <= slow.wall.low <= slow.wall.high <= 0.41
+    assert 0 < slow.waited.mean < 0.05
+    assert slow.cpu.n == 0 or slow.cpu.mean >= 0
+    soft = known.tally(Key("place", "place_soft", "regime=A"))
+    assert soft.cost("value:tries").mean == 2.0
+    assert list(soft.values) == ["tries"]
+    begin = next(flow for key, flow in known.flows.items() if key.transition == "begin")
+    assert begin.fired == 12
+    assert 0 < begin.waits.mean <= 0.05
+    assert selector.learning.question("place").measure == "value:tries"
+
+
+def test_a_preempted_run_is_censored_by_its_transition(task: Task) -> None:
+    """`jam` comes every 1.24 s and takes placing runs, which count none: exposure grows, R does not change."""
+    selector = learner(task, "round_robin", seed=2)
+    run(task, selector, runs=40)
+    tallies = selector.learning.estimates.of("place")
+    censored = {a: t["regime=A"] for a, t in tallies.items() if t["regime=A"].censored}
+    assert censored
+    for tally in censored.values():
+        assert "none:jammed" in tally.durations
+        assert tally.reliability == 1.0
+        assert tally.durations["none:jammed"].high < 0.55
+
+
+@pytest.mark.parametrize("name", sorted(RULES))
+def test_the_same_seed_chooses_the_same(task: Task, name: str) -> None:
+    """Draws are keyed by seed, generation and run; another generation draws others."""
+
+    def choices(**more: int) -> list[tuple[str, str]]:
+        selector = learner(task, name, **more)
+        run(task, selector, runs=25, seed=3)
+        return [(r.primitive_task, r.action) for r in selector.records if isinstance(r, Choice)]
+
+    assert choices(seed=3) == choices(seed=3)
+    if name in ("nikolic_fu", "thompson", "reward_inaction"):
+        assert choices(seed=3) != choices(seed=3, generation=1)
+
+
+def test_replay_derives_the_same_state(task: Task, tmp_path: Path) -> None:
+    """The recorded steps, shown to a fresh selector, leave exactly what the live one had: so a resume goes on as if nothing
+    had happened, and the reasons of the choices stand in the journal."""
+    path = tmp_path / "run.journal"
+    store = JournalStore(JournalWriter(path, {"mission": "m", "mode": "lockstep"}), 0.0)
+    live = learner(task, seed=4)
+    run(task, live, runs=15, seed=4, store=store)
+    store.sync()
+    known, _ = with_runs(task, 15)
+    devices: Mapping[str, str] = {a.name: a.device for a in directory(task).actions.values() if a.device}
+    again = learner(task, seed=4)
+    reasons = []
+    for step in replay(read_journal(path), Engine(known, devices)):
+        again.stimulus(step.time, step.stimulus)
+        reasons.append(getattr(step.stimulus, "reason", ""))
+        for instruction in step.instructions:
+            again.instruction(step.time, instruction)
+        again.settled(step.time, step.state)
+    assert again.records == live.records
+    assert again.learning.state() == live.learning.state()
+    assert again.learning.gained.tallies == live.learning.gained.tallies
+    assert sum("nikolic_fu_fast: " in reason for reason in reasons) == sum(isinstance(r, Choice) for r in live.records)
+
+
+def test_records_of_a_worker_applied_in_order_are_the_same(task: Task) -> None:
+    """A campaign's worker does not learn by itself; its records, applied later, make the same estimates."""
+    worker, master = learner(task, "round_robin", seed=1, live=False), Learning(task, "round_robin")
+    run(task, worker, runs=10)
+    assert not worker.learning.gained.tallies
+    for record in worker.records:
+        master.apply(of_plain(to_plain(record)))
+    assert sum(t.runs for t in master.estimates.tallies.values()) >= 10
+    assert master.applied == len(worker.records)
+
+
+def test_contexts_follow_parameters_variables_and_conditions(task: Task) -> None:
+    """Each part is told by its name and value; a value that was never written is unknown."""
+    contexts = Contexts(("regime", "light < 0.5", "weight > 1.0"))
+    selector = learner(task, "round_robin", seed=1, contexts=contexts)
+    run(task, selector, runs=12, parameters={"regime": "B", "light": 0.3})
+    seen = {k.context for k in selector.learning.estimates.tallies}
+    assert seen == {
+        "regime=B, light < 0.5=true, weight > 1.0=unknown",
+        "regime=B, light < 0.5=true, weight > 1.0=true",
+    }
+    assert usual_contexts(task) == Contexts(("regime",))
+    assert Contexts().of({"regime": "B"}) == ""
+
+
+@pytest.mark.parametrize(("part", "said"), [("speed", "no parameter or variable 'speed'"), ("regime ==", "column")])
+def test_a_context_that_cannot_be_told_is_refused(task: Task, part: str, said: str) -> None:
+    """At the beginning, with the names that there are."""
+    with pytest.raises(ContextError, match=said):
+        LearningSelector(Learning(task), Contexts((part,)))
+
+
+def test_the_users_and_the_operators_choice_come_first(task: Task) -> None:
+    """Both are counted as what they are, and say so."""
+    selector = learner(task, seed=1, chosen={"pick": "pick_slow"})
+    selector.override("place", "place_hard")
+    run(task, selector, runs=4)
+    assert {r.action for r in selector.records if isinstance(r, Choice)} == {"pick_slow", "place_hard"}
+    assert selector.choose("pick", "pick#9", ("pick_fast", "pick_slow"))[1] == "chosen by the user"
+    assert selector.choose("place", "place#9", ("place_soft",))[1] == "chosen by the operator"
+    assert selector.learning.selectors["pick"].learner("regime=A").runs[0, 1] == 4
+
+
+def test_a_deferred_verdict_corrects_r_once(task: Task) -> None:
+    """The engine says it once; a second one, or one on another run, changes nothing."""
+    selector = learner(task, seed=1)
+    selector.settled(0.0, State((0,), {"regime": "A"}))
+    selector.instruction(0.0, StartRun("pick#1", "pick", "pick", "pick_slow", {}, 5.0))
+    ended = RunRecorded("pick#1", "pick", "pick", "pick_slow", Status.SUCCESS, "", "", Executed.YES, 0.4, deferred=True)
+    selector.instruction(0.4, ended)
+    key = Key("pick", "pick_slow", "regime=A")
+    assert selector.learning.estimates.tally(key).reliability == 1.0
+    verdict = Corrected("pick#1", "pick", "pick_slow", Status.SUCCESS, Status.FAILURE, "crooked")
+    for correction in (verdict, verdict, Corrected("pick#2", "pick", "pick_slow", Status.SUCCESS, Status.FAILURE)):
+        selector.instruction(1.0, correction)
+    tally = selector.learning.estimates.tally(key)
+    assert (tally.reliability, tally.corrected, tally.runs) == (0.0, 1, 1)
+    assert selector.learning.selectors["pick"].learner("regime=A").successes[0, 1] == 0.0
+
+
+def test_firings_are_counted(task: Task) -> None:
+    """Every firing is a passage; only transitions that wait for an event alone have a wait."""
+    selector = learner(task, "fixed", seed=1)
+    mission = run(task, selector, runs=5)
+    passages = [r for r in selector.records if isinstance(r, Passage)]
+    assert len(passages) == mission.tally.firings
+    assert {p.transition for p in passages if p.waited is not None} == {"begin"}

@@ -1,0 +1,167 @@
+"""J, rho, scenarios above the target, break-even, the Pareto front, and the target-reliability question both ways."""
+
+from __future__ import annotations
+
+from math import inf, isnan
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from coordinator.learning.estimate import Observation, Tally
+from coordinator.learning.objective import (
+    Comparison,
+    Question,
+    admitted,
+    break_even,
+    compare,
+    cost_to_reach,
+    objective,
+    pareto,
+    reliability_for,
+)
+from coordinator.task import Executed, Status
+
+
+def runs(good: int, bad: int, seconds: float = 1.0, missing: int = 0) -> Tally:
+    """So many successes and failures of one length."""
+    tally = Tally()
+    for _ in range(good):
+        tally = tally.adding(Observation(Status.SUCCESS, seconds))
+    for _ in range(bad):
+        tally = tally.adding(Observation(Status.FAILURE, seconds, "late"))
+    for _ in range(missing):
+        tally = tally.adding(Observation(Status.ERROR, 0.0, "unreachable", Executed.NO))
+    return tally
+
+
+def judged(question: Question | None = None, **actions: Tally) -> Comparison:
+    """A comparison in one scenario."""
+    return compare({name: {"": tally} for name, tally in actions.items()}, question or Question())
+
+
+def test_the_papers_cost_function() -> None:
+    """J = 1 - R + rho C with rho = 1 / max C over the primitive task's own actions."""
+    found = judged(slow=runs(9, 1, 4.0), quick=runs(7, 3, 1.0))
+    assert found.rho == pytest.approx(0.25)
+    assert found.of("slow").j == pytest.approx(1 - 0.9 + 1.0)
+    assert found.of("quick").j == pytest.approx(1 - 0.7 + 0.25)
+    assert found.best == "quick"
+
+
+def test_a_declared_rho_lets_reliability_decide() -> None:
+    """With a small rho the more reliable action wins."""
+    assert judged(Question(rho=0.01), slow=runs(9, 1, 4.0), quick=runs(7, 3, 1.0)).best == "slow"
+
+
+def test_a_dead_nodes_action_is_not_best() -> None:
+    """R = 1 of three runs, but nine in ten starts never execute: A R counts."""
+    found = judged(dead=runs(3, 0, 1.0, missing=27), alive=runs(30, 10, 1.0))
+    assert found.of("dead").reliability == 1.0
+    assert found.of("dead").availability == pytest.approx(0.1)
+    assert found.best == "alive"
+
+
+def test_nothing_known_has_no_j() -> None:
+    """An action without runs is neither best nor a stumbling block."""
+    found = judged(new=Tally(), old=runs(1, 1))
+    assert isnan(found.of("new").j)
+    assert found.best == "old"
+    assert judged(new=Tally()).best is None
+
+
+HARD = {"calm": runs(99, 1, 1.0), "windy": runs(90, 10, 2.0), "storm": runs(50, 50, 5.0)}
+
+
+@pytest.mark.parametrize(
+    ("target", "scenario", "cost"),
+    [(None, "storm", 5.0), (0.3, "storm", 5.0), (0.8, "windy", 2.0), (0.93, "calm", 1.0)],
+)
+def test_cost_is_that_of_the_hardest_scenario_above_the_target(
+    target: float | None, scenario: str, cost: float
+) -> None:
+    """The paper's definition: the lowest reliability among those with values lower-bounded by the target."""
+    figures = compare({"act": HARD}, Question(target=target)).of("act")
+    assert (figures.scenario, figures.cost) == (scenario, cost)
+
+
+def test_no_scenario_above_the_target_makes_inadmissible() -> None:
+    """An empty set: J is infinite, and another action is best whatever its J."""
+    found = compare({"weak": {"": runs(50, 50, 0.1)}, "strong": {"": runs(99, 1, 9.0)}}, Question(target=0.9))
+    assert not found.of("weak").admissible
+    assert found.of("weak").j == inf
+    assert found.best == "strong"
+
+
+def test_membership_has_hysteresis() -> None:
+    """In when the lower bound reaches the target; out only when R itself falls below it."""
+    unsure = {"": runs(46, 4)}  # R .92, Wilson's lower bound .81
+    assert admitted(unsure, 0.9) == ()
+    assert admitted(unsure, 0.9, before=("",)) == ("",)
+    assert admitted({"": runs(89, 11)}, 0.9, before=("",)) == ()
+    assert admitted({"": runs(980, 20)}, 0.9) == ("",)
+
+
+def test_the_largest_cost_over_the_set_is_offered_too() -> None:
+    """The hardest scenario need not be the dearest."""
+    figures = compare({"act": {"hard": runs(90, 10, 1.0), "easy": runs(99, 1, 3.0)}}, Question()).of("act")
+    assert (figures.scenario, figures.cost, figures.largest_cost) == ("hard", 1.0, 3.0)
+    assert figures.scenarios == ("easy", "hard")
+
+
+@given(
+    st.integers(1, 30), st.integers(0, 30), st.integers(1, 30), st.integers(0, 30), st.floats(0.1, 9), st.floats(0.1, 9)
+)
+def test_break_even_is_where_j_is_equal(g1: int, b1: int, g2: int, b2: int, c1: float, c2: float) -> None:
+    """At the break-even rho both J agree; below it the more reliable action is better."""
+    found = judged(one=runs(g1, b1, c1), other=runs(g2, b2, c2))
+    one, other = found.figures
+    rho = break_even(one, other)
+    if rho is None:
+        assert one.cost == other.cost or (one.reliability - other.reliability) * (one.cost - other.cost) < 0
+        return
+    at = [objective(f.reliability, f.cost, rho) for f in (one, other)]
+    assert at[0] == pytest.approx(at[1], abs=1e-6)
+    if rho > 0 and one.reliability != other.reliability:
+        below = [objective(f.reliability, f.cost, rho / 2) for f in (one, other)]
+        assert (below[0] < below[1]) == (one.reliability > other.reliability)
+
+
+@given(st.lists(st.tuples(st.integers(0, 10), st.integers(1, 10), st.floats(0.1, 9)), min_size=1, max_size=6))
+def test_the_pareto_front_is_not_dominated_and_complete(rows: list[tuple[int, int, float]]) -> None:
+    """Nobody beats a member in both; everybody else is matched or beaten by a member."""
+    found = compare({f"a{i}": {"": runs(g, b, c)} for i, (g, b, c) in enumerate(rows)}, Question())
+    front = pareto(found.figures)
+    assert front
+    for f in found.figures:
+        better = [g for g in front if g.reliability >= f.reliability and g.cost <= f.cost]
+        assert better
+        if f in front:
+            assert all((g.reliability, g.cost) == (f.reliability, f.cost) for g in better)
+
+
+def test_the_target_question_both_ways() -> None:
+    """What a reliability costs, and what a cost buys."""
+    found = judged(one=runs(70, 30, 1.0), four=runs(90, 10, 4.0), nine=runs(97, 3, 9.0))
+    reach = {r: cost_to_reach(found.figures, r) for r in (0.5, 0.8, 0.95, 0.99)}
+    assert [None if f is None else f.action for f in reach.values()] == ["one", "four", "nine", None]
+    assert cost_to_reach(found.figures, 0.85, surely=True) == found.of("nine")
+    bought = {c: reliability_for(found.figures, c) for c in (0.5, 1.0, 5.0, 50.0)}
+    assert [None if f is None else f.action for f in bought.values()] == [None, "one", "four", "nine"]
+
+
+def test_more_images_averaged_cost_more_and_are_more_reliable() -> None:
+    """The paper's example: cost is the number of pictures averaged, a value of the result."""
+    tallies = {}
+    for images, good in ((1, 60), (4, 88), (16, 99)):
+        tally = Tally()
+        for i in range(100):
+            status = Status.SUCCESS if i < good else Status.FAILURE
+            tally = tally.adding(Observation(status, 0.02 * images, values={"images": float(images)}))
+        tallies[f"average_{images}"] = {"": tally}
+    found = compare(tallies, Question("value:images"))
+    assert [f.cost for f in found.figures] == [1.0, 4.0, 16.0]
+    assert found.best == "average_4"
+    reach = cost_to_reach(found.figures, 0.95)
+    assert reach is not None
+    assert reach.action == "average_16"

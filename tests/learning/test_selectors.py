@@ -1,0 +1,310 @@
+"""Selectors: the same rules alone and side by side, contexts, targets, dead nodes, and what people may do to them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from coordinator.cli.learning import SELECTORS
+from coordinator.learning.batch import SUMS, Trial, drawn, restricted
+from coordinator.learning.estimate import Observation, Tally
+from coordinator.learning.objective import Question
+from coordinator.learning.selectors import RULES, RuleSelector, make
+from coordinator.task import Executed, Status
+
+ACTIONS = ("a", "b", "c", "d")
+NAMES = sorted(RULES)
+
+
+class Uniform(np.random.Generator):
+    """A generator that gives the numbers it was made with."""
+
+    def __init__(self, rows: Iterable[np.ndarray]) -> None:
+        super().__init__(np.random.PCG64(0))
+        self._rows = iter(rows)
+
+    def random(self, *shape: object, **more: object) -> np.ndarray:  # type: ignore[override]
+        """The next row, as a batch of one."""
+        return next(self._rows)[None, :]
+
+
+def success(seconds: float = 1.0) -> Observation:
+    """A run that met its specification."""
+    return Observation(Status.SUCCESS, seconds)
+
+
+def failure(seconds: float = 1.0) -> Observation:
+    """A run that did not."""
+    return Observation(Status.FAILURE, seconds, "late")
+
+
+def missing() -> Observation:
+    """A run that never began."""
+    return Observation(Status.ERROR, 0.0, "unreachable", Executed.NO)
+
+
+def taught(selector: RuleSelector, context: str = "", good: int = 30) -> RuleSelector:
+    """`b` succeeds always, the others never."""
+    for _ in range(good):
+        for action in ACTIONS:
+            selector.chosen(context, action)
+            selector.update(context, action, success() if action == "b" else failure())
+    return selector
+
+
+def test_the_command_line_names_every_selector() -> None:
+    """--selector offers what there is."""
+    assert set(SELECTORS) == set(RULES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@settings(max_examples=8, deadline=None)
+@given(st.integers(0, 2**31), st.integers(2, 5), st.booleans())
+def test_rows_of_a_batch_are_the_shipped_selector(name: str, seed: int, n: int, costly: bool) -> None:
+    """What the convergence study simulates is, trial by trial and bit by bit, what a mission run uses."""
+    rng = np.random.default_rng(seed)
+    rows, trials, actions = 3, 60, ACTIONS[:n] if n < 5 else (*ACTIONS, "e")
+    u, v = rng.random((trials, rows, n)), rng.random((trials, rows))
+    r, seconds = rng.random(n), rng.random((trials, rows)) + 0.1 if costly else np.zeros((trials, rows))
+    rule, offered = RULES[name](), np.ones((rows, n), dtype=bool)
+    batch = rule.begin(rows, n)
+    alone = [RuleSelector(RULES[name](), actions, Question("wall")) for _ in range(rows)]
+    feeds = [Uniform(u[:, i]) for i in range(rows)]
+    for t in range(trials):
+        chosen = rule.choose(batch, offered, u[t])
+        batch.choosing(chosen)
+        good = v[t] < r[chosen]
+        rule.learn(batch, Trial(chosen, good.astype(float), seconds[t], np.ones(rows, dtype=bool)))
+        for i, selector in enumerate(alone):
+            action, why = selector.choose("", actions, feeds[i])
+            assert action == actions[chosen[i]]
+            assert why.startswith(name)
+            selector.chosen("", action)
+            selector.update("", action, Observation(Status.SUCCESS if good[i] else Status.ERROR, float(seconds[t, i])))
+    for i, selector in enumerate(alone):
+        mine = selector.learner("")
+        for field in ("p", *SUMS):
+            assert np.array_equal(getattr(batch, field)[i], getattr(mine, field)[0]), field
+
+
+@pytest.mark.parametrize("name", NAMES)
+@settings(max_examples=10, deadline=None)
+@given(st.lists(st.tuples(st.sampled_from(ACTIONS), st.sampled_from("SFEMC"), st.floats(0.01, 9)), max_size=40))
+def test_probabilities_are_probabilities_whatever_happens(name: str, ends: list[tuple[str, str, float]]) -> None:
+    """p and the choice probabilities stay in [0, 1] and sum to 1; censored runs teach nothing."""
+    selector = make(name, ACTIONS)
+    for action, end, seconds in ends:
+        outcome = {
+            "S": success(seconds),
+            "F": failure(seconds),
+            "E": Observation(Status.ERROR, seconds, "lost", Executed.UNKNOWN),
+            "M": missing(),
+            "C": Observation(None, seconds, preempted_by="gone"),
+        }[end]
+        before = json.dumps(selector.state()) if end == "C" and selector.learners else ""
+        selector.update("", action, outcome)
+        if before:
+            assert json.dumps(selector.state()) == before
+    for offered in (ACTIONS, ("b", "d"), ("c",)):
+        shares = selector.probabilities("", offered)
+        assert sum(shares.values()) == pytest.approx(1.0)
+        assert all(-1e-12 <= share <= 1 + 1e-12 for share in shares.values())
+        assert all(shares[a] == 0 for a in ACTIONS if a not in offered)
+        assert selector.choose("", offered, np.random.default_rng(1))[0] in offered
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_choosing_changes_nothing(name: str) -> None:
+    """So that a resumed run, which is not asked again, comes to the same state."""
+    selector = taught(make(name, ACTIONS), good=3)
+    before = json.dumps(selector.state())
+    drawn_first = selector.choose("", ACTIONS, np.random.default_rng(7))
+    assert json.dumps(selector.state()) == before
+    assert selector.choose("", ACTIONS, np.random.default_rng(7)) == drawn_first
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_state_survives_plain_data(name: str) -> None:
+    """A restored selector goes on exactly as the one whose state it took."""
+    one = taught(make(name, ACTIONS), "regime=A", 7)
+    other = make(name, ACTIONS)
+    other.restore(json.loads(json.dumps(one.state())))
+    for seed in range(20):
+        rng = [np.random.default_rng(seed) for _ in range(2)]
+        assert one.choose("regime=A", ACTIONS, rng[0]) == other.choose("regime=A", ACTIONS, rng[1])
+        for selector in (one, other):
+            selector.update("regime=A", ACTIONS[seed % 4], success() if seed % 3 else failure())
+    assert one.state() == other.state()
+
+
+@pytest.mark.parametrize("name", [n for n in NAMES if n not in ("fixed", "round_robin")])
+def test_contexts_are_learned_apart(name: str) -> None:
+    """What was learned in one context says nothing about another; frozen, each chooses its own best."""
+    selector = taught(make(name, ACTIONS), "regime=A", 60)
+    for _ in range(240):
+        for action in ACTIONS:
+            selector.chosen("regime=B", action)
+            selector.update("regime=B", action, success() if action == "d" else failure())
+    selector.frozen = True
+    rng = np.random.default_rng(0)
+    assert selector.choose("regime=A", ACTIONS, rng)[0] == "b"
+    assert selector.choose("regime=B", ACTIONS, rng)[0] == "d"
+    fresh = selector.probabilities("regime=C")
+    assert sum(fresh.values()) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_frozen_learns_nothing_and_reset_forgets_all(name: str) -> None:
+    """Frozen: the state stands still and says so. Reset: as new."""
+    selector = taught(make(name, ACTIONS), good=20)
+    selector.frozen = True
+    before = json.dumps(selector.state())
+    selector.chosen("", "a")
+    selector.update("", "a", success())
+    selector.correct("", "b", Status.SUCCESS, Status.FAILURE)
+    assert json.dumps(selector.state()) == before
+    assert "frozen" in selector.choose("", ACTIONS, np.random.default_rng(0))[1]
+    selector.frozen = False
+    selector.reset()
+    assert selector.state() == make(name, ACTIONS).state()
+
+
+def test_a_choice_says_why_with_numbers() -> None:
+    """J, R, runs, C, the probability of the draw, and who would be best."""
+    selector = taught(make("nikolic_fu", ACTIONS), "regime=B", 5)
+    action, why = selector.choose("regime=B", ACTIONS, Uniform([np.array([0.0, 0, 0, 0])]))
+    assert action == "a"
+    assert why == ("nikolic_fu: drawn with 0.060; J 2.000, R 0.000 of 5 runs, C 1; lowest J 1.000 b (regime=B)")
+
+
+def test_an_action_of_a_dead_node_is_left() -> None:
+    """It never executes, so its R stays 1, yet its J grows with each start that comes to nothing."""
+    selector = make("nikolic_fu_fast", ("dead", "alive"))
+    rng = np.random.default_rng(3)
+    for _ in range(5):
+        for action in ("dead", "alive"):
+            selector.chosen("", action)
+            selector.update("", action, success(0.5) if action == "dead" else success(1.0))
+    assert selector.objective("")["dead"] < selector.objective("")["alive"]
+    for _ in range(400):
+        action, _ = selector.choose("", ("dead", "alive"), rng)
+        selector.chosen("", action)
+        selector.update("", action, missing() if action == "dead" else success(1.0))
+    assert selector.learned("")["alive"] > 0.95
+    assert selector.learner("").successes[0, 0] == 5
+
+
+def test_no_tries_are_owed_to_an_action_that_cannot_be_tried() -> None:
+    """First trials count starts, not results: a dead node does not keep them going for ever."""
+    selector = make("nikolic_fu_fast", ("dead", "alive"))
+    for _ in range(5):
+        selector.chosen("", "dead")
+        selector.update("", "dead", missing())
+    assert "first 5" not in selector.choose("", ("dead",), np.random.default_rng(0))[1]
+
+
+def test_a_deferred_verdict_changes_the_sums() -> None:
+    """R falls, J rises; the choice probabilities follow with later trials."""
+    selector = taught(make("nikolic_fu", ACTIONS), good=10)
+    before = selector.objective("")["b"]
+    selector.correct("", "b", Status.SUCCESS, Status.FAILURE)
+    assert selector.objective("")["b"] == pytest.approx(before + 0.1)
+
+
+def test_only_actions_that_meet_the_target_are_sought() -> None:
+    """Cheap but unreliable wins without a target, and is left with one; while nobody meets it, J alone decides."""
+    trials = [("cheap", [success(0.1)] * 6 + [failure(0.1)] * 4), ("sure", [success(5.0)] * 10)]
+
+    def learned(target: float | None) -> str:
+        selector = make("nikolic_fu", ("cheap", "sure"), Question("wall", target))
+        for _ in range(20):
+            for action, outcomes in trials:
+                for outcome in outcomes:
+                    selector.chosen("", action)
+                    selector.update("", action, outcome)
+        return max(selector.learned("").items(), key=lambda item: item[1])[0]
+
+    assert [learned(t) for t in (None, 0.9, 0.999999)] == ["cheap", "sure", "cheap"]
+
+
+def test_sums_are_taken_over_from_estimates() -> None:
+    """Another machine's runs decide the order from then on; a rule that fades its sums keeps its own."""
+    tally = Tally()
+    for _ in range(50):
+        tally = tally.adding(Observation(Status.SUCCESS, 1.0))
+    for name, r in (("nikolic_fu", 1.0), ("tracking", 0.0)):
+        selector = taught(make(name, ACTIONS), good=5)
+        selector.prime("", {"d": tally})
+        batch = selector.learner("")
+        assert batch.reliability()[0, 3] == r
+        assert (batch.runs[0, 3] == 50) == (name == "nikolic_fu")
+
+
+def test_new_and_vanished_alternatives() -> None:
+    """Sums go with their actions, a newcomer is unknown with an equal share, and the gain starts again."""
+    old = taught(make("nikolic_fu", ACTIONS), good=25)
+    new = make("nikolic_fu", ("d", "b", "new"))
+    new.restore(old.state())
+    batch = new.learner("")
+    assert batch.successes[0].tolist() == [0.0, 25.0, 0.0]
+    assert sum(new.learned("").values()) == pytest.approx(1.0)
+    assert new.learned("")["new"] == pytest.approx(1 / 3)
+    assert new.learned("")["b"] > new.learned("")["d"]
+    assert batch.k[0] == 0
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"selector": "ucb1"},
+        {"learners": {"": {"p": [1.0]}}},
+        {"learners": {"": {"p": [0.5, 0.5, 0.5, 0.5]}}},
+    ],
+)
+def test_a_state_that_does_not_fit_is_refused(change: dict[str, object]) -> None:
+    """Another rule's, too short, or no probabilities."""
+    state = taught(make("nikolic_fu", ACTIONS), good=2).state()
+    learners = {"": {**state["learners"][""], **change.get("learners", {}).get("", {})}}  # type: ignore[attr-defined]
+    with pytest.raises(ValueError):
+        make("nikolic_fu", ACTIONS).restore({**state, **change, "learners": learners})
+
+
+def test_unknown_selectors_and_alternatives_are_refused() -> None:
+    """With the names that there are."""
+    with pytest.raises(ValueError, match="nikolic_fu_fast"):
+        make("greedy", ACTIONS)
+    with pytest.raises(ValueError, match="none of x"):
+        make("fixed", ACTIONS).choose("", ("x",), np.random.default_rng(0))
+
+
+def test_round_robin_takes_turns_and_fixed_does_not() -> None:
+    """Each alternative equally often; always the first that is offered."""
+    turns, fixed = make("round_robin", ACTIONS), make("fixed", ACTIONS)
+    rng, seen = np.random.default_rng(0), []
+    for _ in range(8):
+        action, _ = turns.choose("", ACTIONS, rng)
+        turns.chosen("", action)
+        seen.append(action)
+        assert fixed.choose("", ("c", "b"), rng)[0] == "b"
+    assert seen == [*ACTIONS, *ACTIONS]
+
+
+@given(st.lists(st.floats(0.01, 1), min_size=2, max_size=6), st.floats(0, 1, exclude_max=True))
+def test_draws_invert_the_distribution(weights: list[float], u: float) -> None:
+    """The action whose cumulative interval holds u."""
+    p = np.array([weights]) / np.sum(weights)
+    bounds = np.concatenate([[0.0], np.cumsum(p[0])]) / np.cumsum(p[0])[-1]
+    action = int(drawn(p, np.array([u]))[0])
+    assert bounds[action] <= u < bounds[action + 1] or action == len(weights) - 1
+
+
+def test_probabilities_of_what_is_offered() -> None:
+    """Scaled up; equal shares where none was left."""
+    p = np.array([[0.5, 0.5, 0.0]])
+    assert restricted(p, np.array([[True, False, True]])).tolist() == [[1.0, 0.0, 0.0]]
+    assert restricted(p, np.array([[False, False, True]])).tolist() == [[0.0, 0.0, 1.0]]
