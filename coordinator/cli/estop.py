@@ -53,7 +53,7 @@ def run(options: argparse.Namespace) -> int:
     begun = time.perf_counter()
     answers = asyncio.run(order_all(directory, credentials(directory, COORDINATOR), verb, bus=options.bus))
     took = time.perf_counter() - begun
-    coordinator = asyncio.run(_tell(door)) if door is not None and not options.clear else ""
+    coordinator = asyncio.run(_tell(door, options.journal)) if door is not None and not options.clear else ""
     _show(options, answers, coordinator, took)
     return 0 if answers and all(answer.answered for answer in answers) else 3
 
@@ -71,7 +71,7 @@ def _door(options: argparse.Namespace) -> Door | None:
         return None
 
 
-async def _tell(door: Door) -> str:
+async def _tell(door: Door, folder: Path) -> str:
     """Let the coordinator abort its run, so that it does not look for a way around; what came of it, in words."""
     from coordinator.cli.operate.hand import connect
     from coordinator.hmi.client import OperatorError
@@ -80,8 +80,19 @@ async def _tell(door: Door) -> str:
         async with asyncio.timeout(COORDINATOR_PATIENCE), connect(door, None) as client:
             answer = await client.command("estop")
     except (OperatorError, TimeoutError):
-        return f"{door.run}: the coordinator does not answer"
+        return f"{door.run}: " + ("the coordinator does not answer" if _goes_on(door, folder) else "has ended")
     return f"{door.run}: aborted" if answer.get("ok") else f"{door.run}: {answer.get('text')}"
+
+
+def _goes_on(door: Door, folder: Path) -> bool:
+    """Whether the run's door is still there: a run whose devices stop may end by itself."""
+    from coordinator.door_file import find_door
+    from coordinator.runfolder import NoRunError
+
+    try:
+        return find_door(door.run, folder) == door
+    except NoRunError:
+        return False
 
 
 def _show(options: argparse.Namespace, answers: list[Stopped], coordinator: str, took: float) -> None:

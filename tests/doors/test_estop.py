@@ -139,6 +139,21 @@ async def test_estop_reaches_the_bus_though_the_node_is_frozen(tmp_path: Path) -
         await cell.heard(lambda ear: [ear.nmt.get(n) for n in DRIVES] == [NmtState.STOPPED] * len(DRIVES))
 
 
+async def test_a_bus_that_was_stopped_comes_back(tmp_path: Path) -> None:
+    """`--bus` stops node and bus at once; cleared, the task's own recovery configures and enables the drives again."""
+    async with cell_of(tmp_path) as cell:
+        await cell.sweep()
+        assert cell.coordinator is not None
+        code, told = await cell.estop("--bus")
+        (node,) = told["nodes"]
+        assert code == 0 and node["bus"].endswith("all devices stopped by NMT") and node["devices"]
+        await cell.heard(lambda ear: [ear.nmt.get(n) for n in DRIVES] == [NmtState.STOPPED] * len(DRIVES))
+        assert told["coordinator"].endswith(("aborted", "has ended"))
+        assert (await finished(cell.coordinator))[0] == 1
+        assert (await cell.estop("--clear"))[0] == 0
+        await cell.sweep()
+
+
 async def test_estop_without_nodes_says_so(tmp_path: Path) -> None:
     """Nobody is there: exit code 3, and the one who asked knows that nothing was stopped."""
     directory = cell_in(tmp_path)

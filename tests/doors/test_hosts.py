@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import os
 import re
@@ -171,6 +172,15 @@ class Guarded:
         return [f"{name} in {where}" for where, data in outputs.items() for name, form in forms if form in data]
 
 
+def _process_list() -> list[str]:
+    """Command lines and environments of every process that we may look at."""
+    found = []
+    for path in [*Path("/proc").glob("[0-9]*/cmdline"), *Path("/proc").glob("[0-9]*/environ")]:
+        with contextlib.suppress(OSError):
+            found.append(path.read_bytes().decode(errors="replace"))
+    return found
+
+
 def _forms(secret: str) -> list[bytes]:
     raw = [bytes.fromhex(secret)] if re.fullmatch("[0-9a-f]{64}", secret) else []
     return [secret.encode(), *raw, *(repr(one)[2:-1].encode() for one in raw)]
@@ -192,6 +202,7 @@ async def test_a_guarded_cell_works_and_keeps_its_secrets(tmp_path: Path, how: s
         options = ("--journal", "runs", "--report", "report", "--json", "out.json", "--no-page")
         running = asyncio.ensure_future(asyncio.to_thread(cell.petrobot, "run", "sweeping.toml", *options))
         await look_for_token(running)
+        cell.said += _process_list()
         done = await running
         assert done.returncode == 0, done.stderr
         assert json.loads((tmp_path / "out.json").read_text())["status"] == "success"
