@@ -12,6 +12,7 @@ from coordinator.cli.loading import load_task, write_json
 
 if TYPE_CHECKING:
     from coordinator.forecast.history import Training
+    from coordinator.learning.learning import Estimates
     from coordinator.task import Task
 
 EXAMPLE = (
@@ -68,9 +69,10 @@ def _forecast(options: argparse.Namespace) -> int:
     from coordinator.forecast.tables import forecast_text
 
     task = load_task(options.task)
-    trainings, about = _trainings(task, options.estimates)
+    trainings, estimates, about = _trainings(task, options.estimates)
     names = [name for name in options.regime.split(",") if name] or list(trainings)
-    made = register(task, trainings, {name: _request(task, trainings, name, options) for name in names}, about)
+    requests = {name: _request(task, trainings, name, options) for name in names}
+    made = register(task, trainings, requests, about, estimates)
     if options.out is not None:
         write(options.out, made)
     if options.json:
@@ -82,23 +84,26 @@ def _forecast(options: argparse.Namespace) -> int:
     return 0
 
 
-def _trainings(task: Task, path: Path) -> tuple[dict[str, Training], dict[str, Any]]:
-    """Training throws by regime, and what the forecast says about where they come from."""
+def _trainings(task: Task, path: Path) -> tuple[dict[str, Training], Estimates, dict[str, Any]]:
+    """Training throws by regime, the estimates, and what the forecast says about where they come from."""
+    from coordinator.campaign.observed import estimates_of
     from coordinator.campaign.plan import digest, read_manifest
     from coordinator.campaign.table import TABLE, read_table
     from coordinator.forecast.history import by_regime
-    from coordinator.forecast.summed import trainings_of
+    from coordinator.forecast.summed import read_estimates, trainings_of
 
     if not path.is_dir():
-        return trainings_of(task, path), {"estimates": {"file": path.name, "sha256": digest(path)}}
+        known = read_estimates(path)
+        return trainings_of(task, known), known, {"estimates": {"file": path.name, "sha256": digest(path)}}
     plan = read_manifest(path)
     found = by_regime(task, read_table(path / TABLE))
     if not found:
         raise CommandError(2, f"{path}: the table holds no throw yet")
-    return found, {
+    about = {
         "estimates": {"campaign": path.name, "seed": plan.seed, "block": plan.block, "sha256": digest(path / TABLE)},
         "task_sha256": plan.digests["task"],
     }
+    return found, estimates_of(task, read_table(path / TABLE), path.name), about
 
 
 def _request(task: Task, trainings: Mapping[str, Training], regime: str, options: argparse.Namespace) -> Any:

@@ -5,22 +5,30 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from coordinator.analysis.forecast import forecast as solve
-from coordinator.analysis.stochastic import Measured, stochastic_view
+from coordinator.analysis.space import Limits
+from coordinator.analysis.stochastic import NoEstimate, stochastic_view
+from coordinator.campaign.observed import context_of
 from coordinator.forecast.history import Training
 from coordinator.forecast.predict import Request, predict
+from coordinator.learning.learning import Estimates
+from coordinator.propagation import Choice, measured_from
 from coordinator.task import Task
 
 SCHEMA = 1
 METHOD = (
     "Generalised semi-Markov simulation of the net: measured competing risks of each run, in contexts told apart by "
     "chi-square tests, with their measured durations (no phase-type fit); predictive intervals by a cluster bootstrap over "
-    "training throws, with the noise of the new runs."
+    "training throws, with the noise of the new runs. Beside it the exact solution of the stochastic view (GSPN): phase-type "
+    "durations, statuses of one throw independent of each other."
 )
+LARGEST = 200_000
+"""Markings up to which the stochastic view is solved."""
 
 
 class ForecastError(Exception):
@@ -28,15 +36,24 @@ class ForecastError(Exception):
 
 
 def register(
-    task: Task, trainings: Mapping[str, Training], requests: Mapping[str, Request], about: Mapping[str, Any]
+    task: Task,
+    trainings: Mapping[str, Training],
+    requests: Mapping[str, Request],
+    about: Mapping[str, Any],
+    estimates: Estimates | None = None,
 ) -> dict[str, Any]:
-    """A forecast of the regimes in `requests`. `about` says what it rests on. Raises ForecastError."""
+    """A forecast of the regimes in `requests`; `about` says what it rests on. With `estimates` the stochastic view stands beside.
+
+    Raises ForecastError.
+    """
     regimes = {}
     for name, request in requests.items():
         if name not in trainings:
             raise ForecastError(f"no throw of regime {name} was measured; there are {', '.join(trainings)}")
         try:
             regimes[name] = predict(trainings[name], request) | {"choices": request.choices}
+            if estimates is not None:
+                regimes[name]["gspn"] = exact(task, estimates, name, request.choices)
         except ValueError as fault:
             raise ForecastError(f"regime {name or '-'}: {fault}") from fault
     body = {
@@ -84,14 +101,24 @@ def read(path: Path) -> dict[str, Any]:
     return found
 
 
-def exact(task: Task, measured: Measured) -> dict[str, Any]:
-    """The numbers of the stochastic view for one throw, where its space can be solved: a cross-check, not the forecast."""
-    view = stochastic_view(task, measured)
-    found = solve(view)
-    return {
+def exact(task: Task, estimates: Estimates, regime: str, choice: Choice) -> dict[str, Any]:
+    """The numbers of the stochastic view for one run of the task; only `why` where it cannot be solved.
+
+    Its times begin with the initial marking, so they hold the wait for the event that begins the run, too.
+    """
+    try:
+        view = stochastic_view(task, measured_from(task, estimates, context_of(regime), choice))
+        if task.runs_place:
+            view = replace(view, gspn=view.gspn.marked({task.runs_place: 1}))
+        found = solve(view, limits=Limits(states=LARGEST))
+        q90 = found.law().quantile(0.9) if found.completion_probability > 0 else None
+    except (NoEstimate, ValueError, ArithmeticError) as fault:
+        return {"why": str(fault)}
+    numbers = {
         "R_goal": found.goal_reliability,
         "P_complete": found.completion_probability,
         "R_conj": found.conjunctive_reliability,
         "mean": found.done.mean,
-        "markings": found.chain.n,
+        "q90": q90,
     }
+    return {**{k: None if v is None else round(float(v), 6) for k, v in numbers.items()}, "markings": found.chain.n}

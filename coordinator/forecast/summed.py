@@ -17,16 +17,21 @@ from coordinator.learning.learning import Estimates
 from coordinator.task import Kind, Task
 
 
-def trainings_of(task: Task, path: Path) -> dict[str, Training]:
-    """Of an estimates file, by regime. Raises ForecastError."""
+def read_estimates(path: Path) -> Estimates:
+    """What an estimates file holds. Raises ForecastError."""
     try:
         kept = EstimatesFile(path).read() if path.exists() else None
     except EstimatesError as fault:
         raise ForecastError(str(fault)) from fault
     if kept is None or not kept.estimates.tallies:
         raise ForecastError(f"{path} holds no estimates; give a campaign's folder or a file that `run --learn` wrote")
-    regimes = sorted({regime_of(key.context) for key in kept.estimates.tallies})
-    return {regime: Training.of(task, _throws(task, kept.estimates, regime)) for regime in regimes}
+    return kept.estimates
+
+
+def trainings_of(task: Task, estimates: Estimates) -> dict[str, Training]:
+    """Of estimates, by regime."""
+    regimes = sorted({regime_of(key.context) for key in estimates.tallies})
+    return {regime: Training.of(task, _throws(task, estimates, regime)) for regime in regimes}
 
 
 def _throws(task: Task, estimates: Estimates, regime: str) -> list[Throw]:

@@ -24,6 +24,7 @@ def forecast_text(made: Mapping[str, Any]) -> str:
             if found["value"] is not None:
                 low, high = found["interval"]
                 lines.append(f"    {WORDS[figure]:20}{found['value']:.4f}  95 % [{low:.4f}, {high:.4f}]")
+        lines += _exact_lines(said.get("gspn", {}))
         lines.append(f"    product of R's      {said['product']['R_conj']:.4f} as R_conj, if statuses were independent")
         for found in said["dependence"][:3]:
             if found["p"] < 0.01:
@@ -33,6 +34,13 @@ def forecast_text(made: Mapping[str, Any]) -> str:
         lines.append(f"    {said['contexts']} contexts; {_worst(said['residual'])}")
         lines += [f"    note: {note}" for note in said["assumptions"]]
     return "\n".join(lines)
+
+
+def _exact_lines(gspn: Mapping[str, Any]) -> list[str]:
+    if "markings" not in gspn:
+        return [f"    stochastic view: {gspn['why']}"] if gspn else []
+    shown = ", ".join(f"{WORDS[k]} {gspn[k]:.4f}" for k in WORDS if gspn.get(k) is not None)
+    return [f"    stochastic view, {gspn['markings']} markings: {shown}"]
 
 
 def _worst(residual: Sequence[Mapping[str, Any]]) -> str:

@@ -197,3 +197,21 @@ def test_the_same_seed_gives_the_same_forecast(pair: Task, make_throws: Make) ->
     """All chance is seeded."""
     throws = make_throws(300, np.random.default_rng(1))
     assert forecast(pair, throws) == forecast(pair, throws)
+
+
+def test_the_stochastic_view_stands_beside(pair: Task, make_throws: Make) -> None:
+    """It keeps shares and means exactly, but takes statuses for independent: its R_conj is the product, not the truth."""
+    from coordinator.campaign.observed import estimates_of
+    from coordinator.campaign.rows import Row
+    from coordinator.forecast.registered import exact
+
+    throws = make_throws(1500, np.random.default_rng(14))
+    training = Training.of(pair, throws)
+    rows = [Row(i, "", i, 1, i, 1.0, throw) for i, throw in enumerate(throws)]
+    found = exact(pair, estimates_of(pair, rows, "t"), "", choices_of(training))
+    own = figures(measured(training))
+    assert found["R_goal"] == pytest.approx(own["R_goal"], abs=1e-3)
+    assert found["mean"] == pytest.approx(own["mean"] + 0.1, rel=0.01)  # with the wait for the tick
+    product = forecast(pair, throws)["product"]["R_conj"]
+    assert found["R_conj"] == pytest.approx(product, abs=1e-3)
+    assert found["R_conj"] < own["R_conj"] - 0.05
