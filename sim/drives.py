@@ -20,7 +20,7 @@ from services.comm.cia402 import (
 )
 from sim.canopen_node import CanopenNode
 from sim.digital_io import DigitalInputs
-from sim.power_drive import POWERED, PowerDrive
+from sim.power_drive import POWERED, RUNNING, PowerDrive
 from sim.servo import DriveRating, JointServo
 
 INPUTS_NODE: Final = 7
@@ -95,7 +95,9 @@ class Drive(PowerDrive):
     def before_sending(self) -> None:
         """Bring status, position, speed and torque up to date."""
         plant, joint = self.plant, self.joint
-        shown = word, q, qd, torque = self.statusword(), plant.q[joint], plant.qd[joint], self._torque
+        usual = self.state is _ENABLED and self.powered and not self.servo.limited and self._error_since is None
+        word = RUNNING if usual else self.statusword()
+        shown = _, q, qd, torque = word, plant.q[joint], plant.qd[joint], self._torque
         if shown == self._shown:
             return
         self._shown = shown

@@ -52,7 +52,8 @@ class Exposures:
         return True
 
     def put(self, now: float, ready: float, pixels: Picture) -> None:
-        """An image exposed at `now` leaves the camera at `ready` (s)."""
+        """An image exposed at `now` leaves the camera at `ready` (s); nobody writes to it any more."""
+        pixels.flags.writeable = False
         self._waiting.append(Exposed(ready, now, self._sequence, self.generation, pixels))
         self._sequence += 1
 

@@ -32,7 +32,8 @@ POWERED: Final = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_
 _DOWN: Final = (State.FAULT, State.FAULT_REACTION_ACTIVE)
 _ENABLED: Final = State.OPERATION_ENABLED
 _REMOTE, _VOLTAGE, _FOLLOWS = int(StatusBit.REMOTE), int(StatusBit.VOLTAGE_ENABLED), int(StatusBit.FOLLOWS_COMMAND)
-_RUNNING: Final = _ENABLED.word | _REMOTE | _VOLTAGE | _FOLLOWS
+RUNNING: Final = _ENABLED.word | _REMOTE | _VOLTAGE | _FOLLOWS
+"""Statusword of a drive that follows its set points, without the bits of its mode."""
 _ENABLE_MASK, _ENABLE = Command.ENABLE_OPERATION.value
 
 
@@ -138,7 +139,7 @@ class PowerDrive(CanopenNode):
     def statusword(self) -> int:
         """Object 6041h."""
         if self.state is _ENABLED and self.powered:
-            return _RUNNING | self.flags()
+            return RUNNING | self.flags()
         word: int = self.state.word | _REMOTE
         if self.powered:
             word |= _VOLTAGE

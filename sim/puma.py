@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
+from operator import ge, le
 from pathlib import Path
 
 import numpy as np
@@ -100,7 +101,8 @@ class ArmPlant:
         self._limit: list[float] = model.torque.tolist()
         self._viscous: list[float] = model.viscous.tolist()
         self._dry: list[float] = model.coulomb.tolist()
-        self._stops: list[tuple[float, float]] = list(zip(model.lower.tolist(), model.upper.tolist(), strict=True))
+        self._lower: list[float] = model.lower.tolist()
+        self._upper: list[float] = model.upper.tolist()
         self._braked = [True] * JOINTS
         self._hold, self._stick = [0.0] * JOINTS, [0.0] * JOINTS
         for joint in range(JOINTS):
@@ -192,19 +194,22 @@ class ArmPlant:
 
         Last step's friction is the first guess (already in `speed`), so the coupling of the joints settles over a few steps.
         """
-        friction, change = self._friction, []
-        for joint, (f, v, gain, hold) in enumerate(zip(friction, speed, self._diagonal, self._hold, strict=True)):
-            wanted = f - v / (dt * gain)
-            wanted = hold if wanted > hold else -hold if wanted < -hold else wanted
-            if wanted != f:
-                friction[joint] = wanted
-                change.append((dt * (wanted - f), self._inverse[joint]))
-        for push, row in change:  # the matrix is symmetric: a row is a column
-            speed = [v + push * gain for v, gain in zip(speed, row, strict=True)]
+        before = self._friction
+        stopping = [f - v / (dt * gain) for f, v, gain in zip(before, speed, self._diagonal, strict=True)]
+        self._friction = friction = [
+            hold if f > hold else -hold if f < -hold else f for f, hold in zip(stopping, self._hold, strict=True)
+        ]
+        if friction != before:
+            for f, last, row in zip(friction, before, self._inverse, strict=True):
+                if f != last:
+                    push = dt * (f - last)  # the matrix is symmetric: a row is a column
+                    speed = [v + push * gain for v, gain in zip(speed, row, strict=True)]
         return speed
 
     def _stop_at_ends(self) -> None:
-        for i, (angle, (low, high)) in enumerate(zip(self.q, self._stops, strict=True)):
+        if all(map(ge, self.q, self._lower)) and all(map(le, self.q, self._upper)):
+            return
+        for i, (angle, low, high) in enumerate(zip(self.q, self._lower, self._upper, strict=True)):
             if not low <= angle <= high:
                 self.q[i] = min(max(angle, low), high)
                 self.qd[i] = 0.0

@@ -12,6 +12,7 @@ from operator import itemgetter
 from typing import Any, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from services.comm.canbus import Frame
 from services.comm.codec import decode, encode
@@ -22,6 +23,8 @@ from services.comm.plain import SCALARS, NotPlainError, copy_array, plain
 _MESSAGES = frozenset(get_args(Message))
 _FLAT = frozenset((float, int, str, bytes, bool))
 _FRAMES = frozenset((Frame,))
+_DTYPES = (np.dtype("u1"), np.dtype("<f8"))
+_MOST_DIMENSIONS = 4
 _ORDER = itemgetter(0, 1, 2)
 
 _Due = tuple[int, str, int, Envelope]
@@ -40,6 +43,7 @@ class Delays:
 
     def __init__(self, table: Mapping[str, int] | None = None) -> None:
         self._table = dict(table or {})
+        self._ways: dict[tuple[str, str, str], int] = {}
         for name, ticks in self._table.items():
             if type(ticks) is not int or ticks < 1:
                 raise CellError(f"link {name}: a delay of {ticks!r}; give a whole number of ticks, at least 1")
@@ -48,12 +52,17 @@ class Delays:
         """Ticks that this envelope is on its way."""
         if not self._table:
             return 1
-        by_ends = self._table.get(f"{envelope.source}/{envelope.target}")
-        return self._table.get(envelope.channel, 1) if by_ends is None else by_ends
+        way = envelope.source, envelope.target, envelope.channel
+        ticks = self._ways.get(way)
+        if ticks is None:
+            by_ends = self._table.get(f"{envelope.source}/{envelope.target}")
+            ticks = self._ways[way] = self._table.get(envelope.channel, 1) if by_ends is None else by_ends
+        return ticks
 
 
 def as_received(channel: str, body: Any) -> Any:
-    """The body as it arrives in another process: messages checked and in plain data, arrays as tuples, images read-only.
+    """The body as it arrives in another process: messages checked and in plain data, arrays as tuples, images read-only
+    (those that their sender has locked are passed on as they are).
 
     Raises NotPlainError or ProtocolError for what no envelope carries.
     """
@@ -64,10 +73,10 @@ def as_received(channel: str, body: Any) -> Any:
         return decode(encode(body))
     if kind is tuple:
         kinds = set(map(type, body))
-        if kinds <= _FLAT or (channel == "can" and kinds == _FRAMES):
+        if (channel == "can" and kinds == _FRAMES) or kinds <= _FLAT:
             return body
     if isinstance(body, np.ndarray):
-        return copy_array(body)
+        return body if _frozen(body) else copy_array(body)
     if isinstance(body, (tuple, list)):
         return tuple(as_received(channel, item) for item in body)
     if isinstance(body, Mapping):
@@ -75,6 +84,13 @@ def as_received(channel: str, body: Any) -> Any:
             raise NotPlainError("a key of a map is not a str")
         return {key: as_received(channel, item) for key, item in body.items()}
     return plain(body, "body")
+
+
+def _frozen(array: NDArray[Any]) -> bool:
+    """Whether an array is already what would arrive: nobody can write to it, as its maker has locked memory of its own."""
+    flags = array.flags
+    locked = not flags.writeable and flags.owndata and flags.c_contiguous
+    return locked and array.dtype in _DTYPES and array.ndim <= _MOST_DIMENSIONS
 
 
 class Half:
@@ -131,7 +147,8 @@ class Half:
 
     def _post(self, tick: int, sender: str, envelope: Envelope) -> Posted:
         source = envelope.source
-        self.own(source, sender)
+        if self._owners.get(source) != sender:
+            self.own(source, sender)
         if envelope.party not in self._names:
             raise CellError(
                 f"{source} sends to the party {envelope.party}, which is not in the cell: {sorted(self._names)}"

@@ -47,6 +47,8 @@ NEAR_PLACE: Final = 0.02
 """rad, the same while following, where small corrections never end: 5 mm at the cup."""
 LAG_CYCLES: Final = 8
 """Cycles by which the measured joints may follow the commanded ones: bus, links, interpolation, sampling."""
+LAG_PERIOD: Final = 5
+"""Cycles after which the following error is worked out anew: 20 ms."""
 LOST: Final = 0.15
 """rad of following error at which the servo itself gives up, besides the drives' own watch."""
 BALL: Final = 0x01
@@ -81,6 +83,7 @@ class Arm:
         self._leased_until = 0.0
         self._after_stop = ""
         self._commanded: deque[list[float]] = deque(maxlen=LAG_CYCLES + 1)
+        self._off_path = 0.0
         self._measured = [0.0] * JOINTS
         self._measured_speed = [0.0] * JOINTS
         self._cycles = 0
@@ -139,7 +142,7 @@ class Arm:
             "commanded": tuple(trajectory.q),
             "in_place": self._in_place(),
             "still": self._standing(),
-            "following_error": self._lag(),
+            "following_error": self._off_path if self._mode != "off" else 0.0,
             "guard": self._steering.refused,
             "limited": master.limited,
             "faults": [(trouble.cause, trouble.joint, trouble.code, trouble.text) for trouble in master.troubles],
@@ -262,6 +265,8 @@ class Arm:
         if self._mode == "follow":
             self._follow_on(now)
         self._advance()
+        if self._cycles % LAG_PERIOD == 0:
+            self._off_path = self._lag()
         if self._after_stop and self._trajectory.still:
             self._after_stop, self._master.wanted = "", False
 

@@ -78,8 +78,8 @@ class Guard:
         return self._placed(q, *self._forearm(q))
 
     def _placed(self, q: Sequence[float], elbow: Point, wrist: Point) -> Placement:
-        turn = _Turn(q)
-        offset, axis = turn.apply(self._cell.cup.mouth), turn.apply(self._cell.cup.axis)
+        turn = _turn(q)
+        offset, axis = _turned(turn, self._cell.cup.mouth), _turned(turn, self._cell.cup.axis)
         return Placement(elbow, wrist, (wrist[0] + offset[0], wrist[1] + offset[1], wrist[2] + offset[2]), axis)
 
     def _forearm(self, q: Sequence[float]) -> tuple[Point, Point]:
@@ -190,18 +190,29 @@ class Guard:
         return trajectory.q is self._vouched or not self.violation(trajectory.resting(trajectory.q, trajectory.qd))
 
 
-class _Turn:
-    """Rotation of frame 6 in the base frame, applied to vectors."""
+def _turn(q: Sequence[float]) -> tuple[float, ...]:
+    """Rotation of frame 6 in the base frame: cosine and sine of each angle on the way."""
+    cos, sin, elbow = math.cos, math.sin, q[1] + q[2]
+    return (
+        cos(q[0]),
+        sin(q[0]),
+        cos(elbow),
+        sin(elbow),
+        cos(q[3]),
+        sin(q[3]),
+        cos(q[4]),
+        sin(q[4]),
+        cos(q[5]),
+        sin(q[5]),
+    )
 
-    def __init__(self, q: Sequence[float]) -> None:
-        self._angles = [(math.cos(a), math.sin(a)) for a in (q[0], q[1] + q[2], q[3], q[4], q[5])]
 
-    def apply(self, vector: Point) -> Point:
-        """A vector of frame 6 in the base frame."""
-        (c1, s1), (c23, s23), (c4, s4), (c5, s5), (c6, s6) = self._angles
-        x, y, z = vector
-        x, y = c6 * x - s6 * y, s6 * x + c6 * y
-        x, z = c5 * x - s5 * z, s5 * x + c5 * z  # the twists before and after joint 5 cancel
-        x, y = c4 * x - s4 * y, s4 * x + c4 * y
-        radial, up = c23 * x - s23 * z, s23 * x + c23 * z
-        return c1 * radial - s1 * y, s1 * radial + c1 * y, up
+def _turned(turn: tuple[float, ...], vector: Point) -> Point:
+    """A vector of frame 6 in the base frame."""
+    c1, s1, c23, s23, c4, s4, c5, s5, c6, s6 = turn
+    x, y, z = vector
+    x, y = c6 * x - s6 * y, s6 * x + c6 * y
+    x, z = c5 * x - s5 * z, s5 * x + c5 * z  # the twists before and after joint 5 cancel
+    x, y = c4 * x - s4 * y, s4 * x + c4 * y
+    radial, up = c23 * x - s23 * z, s23 * x + c23 * z
+    return c1 * radial - s1 * y, s1 * radial + c1 * y, up

@@ -88,7 +88,8 @@ class _Search:
     def _look(self, image: Image) -> Track | None:
         self._images += 1
         background = self._camera.background
-        places = self._camera.view.to_table(self._detector.detect(image.pixels))
+        candidates = self._detector.detect(image.pixels)
+        places = self._camera.view.to_table(candidates) if len(candidates) else candidates
         if not background.known or self._images % LEARN_EVERY == 0:
             background.learn(image.pixels)
         return self._confirmation.add(image.time, places)

@@ -71,6 +71,8 @@ class Background:
 
 def ball_blobs(mask: Pixels, radius: float, streak: float) -> Array:
     """Centroids (n, 2) of the regions of a mask (0 or 255) that have a ball's size and shape; radius and streak in its px."""
+    if cv2.countNonZero(mask) == 0:  # most often: nothing rolls
+        return NOTHING
     count, _, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=8)
     if count <= 1:
         return NOTHING
