@@ -104,7 +104,8 @@ class TrackLaboratory(LaboratoryParty):
         if now >= self._watch_due - 1e-9:
             self._watch_due += _WATCH
             self.rover.move_to(now)
-            self.referee.watch(now, self.rover.pose, self.rover.speed)
+            if self.referee.watch(now, self.rover.pose, self.rover.speed):
+                self.bus.power(False)
         self.now = now + TICK
 
     def take_on_bus(self, now: float, frames: Sequence[Frame]) -> None:

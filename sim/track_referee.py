@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Final
 
-from sim.track import Gap, Near, Track
-from sim.track_elements import Pose
+from sim.track import BOARD, Gap, Near, Track
+from sim.track_elements import SQUARE, Pose
 
 LEFT: Final = 0.30
 """m off the centre line at which the track counts as left."""
@@ -29,6 +29,8 @@ STANDING_FOR: Final = 0.5
 """... for so many seconds."""
 DEPARTED: Final = 0.01
 """m from where it was put down at which the clock starts."""
+OFF_BOARD: Final = 1.0
+"""m beyond the board's edge at which somebody stops the rover."""
 ROW_PERIOD: Final = 0.2
 """s between two rows of the path."""
 _BEHIND, _AHEAD = 0.6, 1.2
@@ -78,6 +80,7 @@ class Referee:
     _off: float = 0.0
     _squares: float = 0.0
     _most: float = 0.0
+    _removed: bool = False
     _first: Pose | None = None
     _last: Pose | None = None
     _still_since: float | None = None
@@ -87,25 +90,30 @@ class Referee:
         kinds = [element.kind for element in self.track.elements if not element.painted]
         self._crossings = [_Crossing(gap, kind.name.lower()) for gap, kind in zip(self.track.gaps, kinds, strict=True)]
 
-    def watch(self, now: float, pose: Pose, speed: float) -> None:
-        """The body is at `pose` and goes at `speed` (m/s) at a moment (s)."""
+    def watch(self, now: float, pose: Pose, speed: float) -> bool:
+        """The body is at `pose` and goes at `speed` (m/s) at a moment (s). Says whether the rover has just left the board, where
+        somebody presses its emergency stop."""
         if not self._path or now - self.began >= self._path[-1][0] + ROW_PERIOD - 1e-9:
             self._path.append((now - self.began, *pose))
-        if self.stopped is not None:
-            return
+        if self.stopped is not None or self._removed:
+            return False
         if self._first is None:
             self._first = pose
         last, self._last = self._last, pose
         step = 0.0 if last is None else math.hypot(pose.x - last.x, pose.y - last.y)
         if self.departed is None:
             if math.hypot(pose.x - self._first.x, pose.y - self._first.y) < DEPARTED:
-                return
+                return False
             self.departed = now
         self._way += step
         if step > 0.0 and self.phase is not Phase.END:
             self._locate(now, pose, step)
         if self.phase is Phase.END:
             self._await_stop(now, pose, speed)
+        if not all(-OFF_BOARD <= at <= BOARD * SQUARE + OFF_BOARD for at in (pose.x, pose.y)):
+            self._removed = True
+            self._penalize(now, "left_board", pose)
+        return self._removed
 
     def _locate(self, now: float, pose: Pose, step: float) -> None:
         near = self.track.nearest(pose.x, pose.y)

@@ -227,6 +227,21 @@ def test_a_bus_that_is_off_lets_the_drives_stop(rover_bench: Bench) -> None:
     assert bench.run(lambda: bench.lab.rover.speed > 0.4, 2.0)
 
 
+def test_a_rover_that_leaves_the_board_gets_no_power_before_the_next_experiment(rover_bench: Bench) -> None:
+    bench = prepared(rover_bench)
+    rover = bench.lab.rover
+    rover.x, rover.y, rover.heading = 16.5, 8.0, 0.0
+    bench.drive(0.5, 0.0)
+    assert bench.run(lambda: bool(rover.wheels[0].braked), 3.0)
+    assert rover.x < 17.1
+    bench.wait(0.5)  # the bench's master tries to reset the fault
+    assert rover.standing
+    assert not bench.master.enabled
+    assert [each["kind"] for each in bench.call("laboratory_score").values["penalties"]][-1] == "left_board"
+    bench.call("laboratory_prepare", seed=1)
+    assert bench.run(lambda: bench.master.enabled, 1.0)
+
+
 def test_every_fault_can_be_asked_for(rover_bench: Bench) -> None:
     bench = prepared(rover_bench)
     for kind, keys in ROVER_FAULTS.keys.items():

@@ -139,6 +139,18 @@ def test_coming_back_after_running_over_the_t_does_not_count_as_stopping() -> No
     assert kinds(score) == ["not_stopped"]
 
 
+def test_a_rover_that_leaves_the_board_is_stopped_once() -> None:
+    referee, now = Referee(TRACK, 1, "straight", 0.0), 0.0
+    told = []
+    for k in range(1200):
+        now += DT
+        told.append(referee.watch(now, Pose(0.01 * k, 7.0 + 0.01 * k, 0.0), SPEED))
+    assert told.count(True) == 1
+    score = referee.score(now)
+    assert kinds(score) == ["track_left", "left_board"]
+    assert score["penalties"][1]["y"] == pytest.approx(17.0, abs=0.02)
+
+
 def test_the_clock_starts_with_the_first_motion() -> None:
     referee = Referee(TRACK, 1, "straight", 5.0)
     for k in range(500):
