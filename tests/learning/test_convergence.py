@@ -57,7 +57,7 @@ def test_the_textbook_gain_needs_longer_and_gets_there() -> None:
     ids=["k^-0.6", "c = 2"],
 )
 def test_gains_outside_the_conditions_stick(rule: NikolicFu) -> None:
-    """Negative controls: many seeds end with all probability on a wrong action, and three times the trials change next to nothing."""
+    """Negative controls: many seeds end at a wrong action, and three times the trials change next to nothing."""
     played = play(rule, free(0.2, 0.6), 3000, 300, np.random.default_rng(1), (1000, 3000))
     stuck = played.p_best < 0.01
     assert stuck[0].mean() > 0.1

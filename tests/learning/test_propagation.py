@@ -1,0 +1,296 @@
+"""From actions to the task: competing risks against closed forms, series products, preemption as a cause, and the sorting task."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import exp
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from coordinator.analysis.completion import completion
+from coordinator.analysis.forecast import forecast
+from coordinator.analysis.gspn import Chain
+from coordinator.analysis.stochastic import Measured, stochastic_view
+from coordinator.launch import with_runs
+from coordinator.learner import LearningSelector
+from coordinator.learning.competing import incidences
+from coordinator.learning.estimate import Key, Observation, Tally
+from coordinator.learning.learning import Estimates, Learning
+from coordinator.propagation import measured_from, propagate
+from coordinator.task import Estimate, Executed, Status, Task
+from coordinator.taskfile import loads
+from tests.learning.cell import run, sorting
+
+SERIES = """
+schema = 1
+[task]
+name = "series"
+goal = "all done"
+runs_place = "runs"
+final = "runs == 0 and free == 1"
+[places.runs]
+kind = "control"
+tokens = 1
+[places.free]
+kind = "resource"
+tokens = 1
+capacity = 1
+[transitions.begin]
+in = ["runs", "free"]
+out = ["a"]
+"""
+
+
+def series(n: int) -> Task:
+    """n primitive tasks a, b, ... one after the other; an error ends the run."""
+    names = "abcdef"[:n]
+    text = SERIES
+    for i, name in enumerate(names):
+        following = names[i + 1] if i + 1 < n else "free"
+        text += f"""
+[primitive_tasks.{name}]
+goal = "{name}"
+alternatives = ["do_{name}", "try_{name}"]
+deadline = 10.0
+[places.{name}]
+kind = "action"
+task = "{name}"
+[transitions.{name}_done]
+in = ["{name}:normal"]
+out = ["{following}"]
+[transitions.{name}_failed]
+in = ["{name}:error"]
+out = ["free"]
+"""
+    return loads(text, "series")
+
+
+def tally(good: int, bad: int, error: int, seconds: float) -> Tally:
+    """Runs of one length by status."""
+    out = Tally()
+    for status, n in ((Status.SUCCESS, good), (Status.FAILURE, bad), (Status.ERROR, error)):
+        for _ in range(n):
+            out = out.adding(Observation(status, seconds, "" if status is Status.SUCCESS else "why"))
+    return out
+
+
+Counts = tuple[int, int, int, float]
+COUNTS = st.tuples(st.integers(1, 20), st.integers(0, 5), st.integers(0, 5), st.floats(0.1, 5))
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.lists(st.tuples(COUNTS, COUNTS, st.floats(0, 1)), min_size=1, max_size=3))
+def test_a_series_comes_to_the_conjunctive_product(rows: list[tuple[Counts, Counts, float]]) -> None:
+    """R = R_1 R_2 ... with each R_i mixed as its alternatives are chosen; costs add as far as runs come."""
+    task, estimates = series(len(rows)), Estimates()
+    choice, expected_r, reach, expected_c = {}, 1.0, 1.0, 0.0
+    for name, (one, other, share) in zip("abc", rows, strict=False):
+        estimates.tallies[Key(name, f"do_{name}")] = tally(*one)
+        estimates.tallies[Key(name, f"try_{name}")] = tally(*other)
+        choice[name] = {f"do_{name}": share, f"try_{name}": 1 - share}
+        mixed = [(share, *one), (1 - share, *other)]
+        expected_r *= sum(w * g / (g + b + e) for w, g, b, e, _ in mixed)
+        expected_c += reach * sum(w * c for w, *_, c in mixed)
+        reach *= sum(w * (g + b) / (g + b + e) for w, g, b, e, _ in mixed)
+    found = propagate(task, estimates, choice=choice)
+    assert found.conjunctive == pytest.approx(expected_r, abs=1e-9)
+    assert found.product == pytest.approx(expected_r, abs=1e-9)
+    assert found.cost == pytest.approx(expected_c, rel=1e-9)
+    assert found.forecast.mission_time == pytest.approx(expected_c, rel=1e-6)
+
+
+def test_loops_and_recoveries_are_not_products() -> None:
+    """An action that is repeated until it succeeds: R_conj is the first try's, but the task always completes."""
+    text = (
+        SERIES
+        + """
+[primitive_tasks.a]
+goal = "a"
+alternatives = ["do_a"]
+deadline = 10.0
+[places.a]
+kind = "action"
+task = "a"
+[transitions.done]
+in = ["a:normal"]
+out = ["free"]
+[transitions.again]
+in = ["a:error"]
+out = ["a"]
+"""
+    )
+    found = propagate(loads(text, "loop"), Estimates({Key("a", "do_a"): tally(3, 0, 1, 2.0)}))
+    assert found.conjunctive == pytest.approx(0.75)
+    assert found.complete == pytest.approx(1.0)
+    assert found.parts["a"].runs == pytest.approx(4 / 3)
+    assert found.cost == pytest.approx(2.0 * 4 / 3)
+    assert found.forecast.mission_time == pytest.approx(2.0 * 4 / 3, rel=1e-6)
+
+
+def test_what_never_executed_takes_the_error_branch() -> None:
+    """It does not lower R, but it lowers what the task comes to."""
+    known = tally(9, 0, 0, 1.0)
+    known = known.adding(Observation(Status.ERROR, 0.0, "unreachable", Executed.NO))
+    task = replace(series(1))
+    measured = measured_from(task, Estimates({Key("a", "do_a"): known}))
+    assert known.reliability == 1.0
+    assert measured.runs["a", "do_a"][Status.SUCCESS].share == pytest.approx(0.9)
+    assert measured.runs["a", "do_a"][Status.ERROR].share == pytest.approx(0.1)
+    assert propagate(task, Estimates({Key("a", "do_a"): known})).conjunctive == pytest.approx(0.9)
+
+
+# --- competing risks ---------------------------------------------------------------------------------------------------
+
+
+def test_incidences_without_cut_offs_are_relative_frequencies() -> None:
+    """Shares, means and variances of the sample itself."""
+    found = incidences([1.0, 2.0, 2.0, 5.0], ["success", "success", "error", "success"])
+    assert found["success"].share == pytest.approx(0.75)
+    assert found["success"].mean == pytest.approx(8 / 3)
+    assert found["success"].cv == pytest.approx(np.std([1, 2, 5]) / (8 / 3))
+    assert found["error"].share == pytest.approx(0.25)
+    assert found["error"].mean == pytest.approx(2.0)
+
+
+def test_incidences_of_a_textbook_example() -> None:
+    """By hand: a at 1 (5 going), cut off at 2, b at 3 (3 going), a at 4 (2 going), cut off at 5."""
+    found = incidences([1, 2, 3, 4, 5], ["a", None, "b", "a", None])
+    a, b = 1 / 5 + (4 / 5) * (2 / 3) * (1 / 2), (4 / 5) * (1 / 3)
+    assert found["a"].share == pytest.approx(a / (a + b))
+    assert found["b"].share == pytest.approx(b / (a + b))
+    assert incidences([], []) == {}
+
+
+@pytest.mark.parametrize("cut", [0.0, 0.5, 2.0])
+def test_incidences_see_through_cut_offs(cut: float) -> None:
+    """Two exponential causes (rates 2 and 1) with exponential cut-offs: shares 2/3 and 1/3, mean 1/3, all unbiased; counting
+    the ends alone would get the mean wrong."""
+    rng = np.random.default_rng(5)
+    n = 20_000
+    a, b = rng.exponential(1 / 2, n), rng.exponential(1.0, n)
+    c = rng.exponential(1 / cut, n) if cut else np.full(n, np.inf)
+    times = np.minimum(np.minimum(a, b), c)
+    causes = [None if t == z else ("a" if t == x else "b") for t, x, z in zip(times, a, c, strict=True)]
+    found = incidences(times.tolist(), causes)
+    assert found["a"].share == pytest.approx(2 / 3, abs=0.02)
+    assert found["a"].mean == pytest.approx(1 / 3, abs=0.03)
+    assert found["b"].cv == pytest.approx(1.0, abs=0.1 if cut < 1 else 0.25)
+    if cut:
+        naive = times[np.array([x is not None for x in causes])].mean()
+        assert naive < 0.3
+
+
+# --- preemption ----------------------------------------------------------------------------------------------------------
+
+
+def caught_or_missed(n: int, caught: int) -> Tally:
+    """Of n runs, `caught` are preempted near 0.5 s and count as success, the others end as failures at 1.2 s."""
+    rng = np.random.default_rng(1)
+    out = Tally()
+    for i in range(n):
+        if i < caught:
+            seen = Observation(Status.SUCCESS, 0.5 + 0.05 * rng.random(), preempted_by="jammed")
+        else:
+            seen = Observation(Status.FAILURE, 1.2, "missed")
+        out = out.adding(seen, "x")
+    return out
+
+
+def test_a_preempting_event_is_a_cause_not_a_race() -> None:
+    """The event comes at half a second in 93 of 100 runs or never. As a cause its share is met exactly; an independent
+    exponential with the same mean wait would make it 58 to 87 %."""
+    task, _ = with_runs(sorting(), 1)
+    estimates = Estimates(
+        {
+            Key("pick", "pick_slow"): tally(1, 0, 0, 0.4),
+            Key("place", "place_soft"): caught_or_missed(100, 93),
+        }
+    )
+    measured = measured_from(task, estimates)
+    assert measured.preempted["place", "place_soft"]["jammed"].share == pytest.approx(0.93)
+    found = forecast(stochastic_view(task, measured, stages=30))
+    assert found.firings["jammed"] == pytest.approx(0.93, abs=1e-9)
+    mean = 0.02 + 0.4 + 0.93 * measured.preempted["place", "place_soft"]["jammed"].mean + 0.07 * 1.2
+    assert found.mission_time == pytest.approx(mean, rel=1e-6)
+    race = replace(measured, preempted={}, waits={"jam": measured.preempted["place", "place_soft"]["jammed"].mean})
+    assert forecast(stochastic_view(task, race)).firings["jammed"] < 0.88
+
+
+def test_causes_leave_nothing_behind() -> None:
+    """Every marking at the end is clean: a law of preemption whose transition was not the one that took the run is flushed."""
+    task, _ = with_runs(sorting(), 2)
+    runs = {("pick", "pick_slow"): {Status.SUCCESS: Estimate(1.0, 0.4)}, ("place", "place_soft"): {}}
+    choice = {"pick": {"pick_slow": 1.0}, "place": {"place_soft": 1.0}}
+    measured = Measured(runs, choice, {}, {}, {("place", "place_soft"): {"jammed": Estimate(1.0, 0.5, 0.7)}})
+    view = stochastic_view(task, measured)
+    found = forecast(view)
+    assert found.completion_probability == pytest.approx(1.0)
+    assert found.firings["jammed"] == pytest.approx(2.0)
+    places, own = view.gspn.net.places, len(task.net.places)
+    dirty = found.chain.space.where(
+        lambda m: any(n and not p.endswith(".server") for p, n in zip(places[own:], m[own:], strict=True))
+    )
+    assert found.done.goal.any()
+    assert not np.any(dirty & found.done.goal)
+
+
+def test_an_abort_is_a_mere_cut_off() -> None:
+    """Runs that the operator broke off are censored: their shares go by competing risks over the sample."""
+    rng, out = np.random.default_rng(2), Tally()
+    for _ in range(400):
+        end, cut = rng.exponential(1.0), rng.exponential(2.0)
+        status = Status.SUCCESS if rng.random() < 0.7 else Status.ERROR
+        seen = Observation(None, cut, preempted_by="") if cut < end else Observation(status, end, "why")
+        out = out.adding(seen, "x")
+    law = measured_from(series(1), Estimates({Key("a", "do_a"): out})).runs["a", "do_a"]
+    assert law[Status.SUCCESS].share == pytest.approx(0.7, abs=0.06)
+    assert law[Status.SUCCESS].mean == pytest.approx(1.0, abs=0.2)
+    assert sum(e.share for e in law.values()) == pytest.approx(1.0)
+
+
+# --- the whole loop ------------------------------------------------------------------------------------------------------
+
+
+def test_the_forecast_of_a_learned_task_meets_its_runs() -> None:
+    """Runs of the sorting task, estimates, the stochastic view, and what the runs themselves had: firings and time agree."""
+    task, n = sorting(), 150
+    selector = LearningSelector(Learning(task, "round_robin"), seed=1)
+    mission = run(task, selector, runs=n, seed=1)
+    one, _ = with_runs(task, 1)
+    found = propagate(one, selector.learning.estimates, "regime=A", measure="wall")
+    fired = {k.transition: f.fired / n for k, f in selector.learning.estimates.flows.items()}
+    for transition, share in fired.items():
+        assert found.forecast.firings[transition] == pytest.approx(share, abs=0.02), transition
+    assert found.forecast.mission_time == pytest.approx((mission.ended - mission.begun) / n, rel=0.03)
+    assert found.goal == pytest.approx(fired["placed"], abs=0.02)
+
+
+def test_uniformly_censored_exponential_has_the_classic_rate() -> None:
+    """lambda = ends / exposure, cut-off runs included (exponential case)."""
+    rng, out = np.random.default_rng(3), Tally()
+    for _ in range(3000):
+        t = rng.exponential(2.0)
+        seen = Observation(Status.SUCCESS, t) if t < 1 else Observation(None, 1.0, preempted_by="jammed")
+        out = out.adding(seen)
+    assert out.exposure / out.runs == pytest.approx(2.0, rel=0.06)
+    assert out.runs / (out.runs + out.censored) == pytest.approx(1 - exp(-0.5), abs=0.03)
+
+
+def test_a_view_without_preempting_measurements_is_as_before() -> None:
+    """Declared waits race, as documented, where no run was measured."""
+    task, _ = with_runs(sorting(), 1)
+    runs = {
+        ("pick", "pick_slow"): {Status.SUCCESS: Estimate(1.0, 1.0)},
+        ("place", "place_soft"): {Status.SUCCESS: Estimate(1.0, 1.0)},
+    }
+    choice = {"pick": {"pick_slow": 1.0}, "place": {"place_soft": 1.0}}
+    view = stochastic_view(task, Measured(runs, choice, {"jam": 1.0}))
+    chain = Chain.of(view.gspn)
+    assert not any(".by." in p for p in view.gspn.net.places)
+    assert forecast(view).firings["jammed"] == pytest.approx(0.5)
+    assert completion(
+        chain, chain.space.where(lambda m: view.projected(m) == (0, 1, 0, 0))
+    ).probability == pytest.approx(1.0)
