@@ -17,17 +17,7 @@ from typing import Any, Final
 
 from services.comm import messages as m
 from services.comm.events import EventIntake
-from services.comm.notice import (
-    Accepted,
-    Answered,
-    Ended,
-    EventArrived,
-    Late,
-    Notice,
-    PeerBack,
-    PeerLost,
-    Progress,
-)
+from services.comm.notice import Accepted, Answered, Ended, EventArrived, Late, Notice, PeerBack, PeerLost, Progress
 from services.comm.plain import plain
 from services.comm.settled import Settled
 from services.comm.under_way import NEVER, Patience, Pending, UnderWay
@@ -65,7 +55,7 @@ class Caller:
         self._messages: list[m.Message] = []
         self._notices: list[Notice] = []
         self._takers: Mapping[type, Callable[[float, Any], None]] = {
-            m.Outcome: self.take_outcome,
+            m.Outcome: lambda now, outcome: self.take_outcomes(now, (outcome,)),
             m.Accept: self._take_accept,
             m.Feedback: self._take_feedback,
             m.Event: self._take_event,
@@ -255,17 +245,26 @@ class Caller:
         if taker is not None:
             taker(now, message)
 
-    def take_outcome(self, now: float, outcome: m.Outcome) -> None:
-        """`receive` of a result."""
-        id_ = outcome.id
-        pending = self._pending.pop(id_, None)
-        if pending is not None:
+    def take_outcomes(self, now: float, outcomes: Iterable[m.Outcome]) -> None:
+        """`receive` of results."""
+        safe: list[str] = []
+        for outcome in outcomes:
+            id_ = outcome.id
+            pending = self._pending.pop(id_, None)
+            if pending is None:
+                if id_ not in safe:
+                    self._take_late(now, outcome)
+                continue
             if pending.done is not None or self._auto_ack:
-                self._ack(now, id_)
+                safe.append(id_)
             else:
                 self._settled.end(id_, False)
             self._tell_end(pending, outcome)
-            return
+        if safe:
+            self._ack(now, *safe)
+
+    def _take_late(self, now: float, outcome: m.Outcome) -> None:
+        id_ = outcome.id
         safe = self._settled.is_safe(id_)
         if safe is None:
             self._settled.turn_up(id_)
@@ -332,9 +331,7 @@ class Caller:
     def messages(self, now: float | None = None) -> list[m.Message]:
         """What to send, in order; each message is given once. Acknowledgements wait for others until `now` reaches theirs."""
         if now is None or now >= self._settled.due:
-            ack = self._settled.take_acks()
-            if ack is not None:
-                self._messages.append(ack)
+            self._messages += self._settled.take_acks()
         if not self._messages:
             return []
         messages, self._messages = self._messages, []
@@ -363,9 +360,9 @@ class Caller:
         self._pending.watch_result(pending, due)
         self.soonest = min(self.soonest, due)
 
-    def _ack(self, now: float, id_: str) -> None:
+    def _ack(self, now: float, *ids: str) -> None:
         if self.up:
-            self._settled.acknowledge(now, id_)
+            self._settled.acknowledge(now, *ids)
             if self._settled.due < self.soonest:
                 self.soonest = self._settled.due
 

@@ -14,7 +14,7 @@ import itertools
 import random
 import ssl
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, cast
 
 from services.comm.caller import Caller, Notice
 from services.comm.link import READ_BUFFER, Limits, Link, Timing, clock_of
@@ -46,18 +46,18 @@ class _ClientLink(Link):
 
     def took(self, now: float, messages: list[Message]) -> None:
         client = self._client
-        receive, take_outcome = client.caller.receive, client.caller.take_outcome
+        if type(messages[0]) is Outcome and all(type(message) is Outcome for message in messages):
+            client.caller.take_outcomes(now, cast("list[Outcome]", messages))
+            messages = []
         for message in messages:
-            if type(message) is Outcome:
-                take_outcome(now, message)
-            elif isinstance(message, Welcome):
+            if isinstance(message, Welcome):
                 self.welcome = True
                 self.opened()
                 client.welcomed(now, self, message)
             elif isinstance(message, Refuse):
                 self.refusal = message
             elif not isinstance(message, Bye):
-                receive(now, message)
+                client.caller.receive(now, message)
         client.flush(now)
 
     def unsendable(self, message: Message, fault: ProtocolError) -> Message | None:

@@ -7,7 +7,7 @@ import contextlib
 import secrets
 import socket
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
 
@@ -221,12 +221,12 @@ class Link(asyncio.BufferedProtocol):
             self._timer.cancel()
         self._timer = self.loop.call_at(self._heart.due(), self._beat)
 
-    def send(self, messages: Iterable[Message]) -> None:
+    def send(self, messages: Sequence[Message]) -> None:
         """Send messages in one write. One that no frame can carry is answered for by `unsendable`."""
         transport = self._transport
         if transport is None or transport.is_closing():
             return
-        transport.write(b"".join([self._bytes(message) for message in messages]))
+        transport.write(self._all_bytes(messages))
         if self.slow and transport.get_write_buffer_size() > self.limits.buffer_hard:
             self.cut(f"it does not read: {self.limits.buffer_hard} bytes wait for it")
 
@@ -236,6 +236,12 @@ class Link(asyncio.BufferedProtocol):
             self.send((message,))
             return
         self._transport.write(self._bytes(message))
+
+    def _all_bytes(self, messages: Sequence[Message]) -> bytes:
+        if not self.slow and not self._opening:
+            with contextlib.suppress(ProtocolError):
+                return self.connection.send_all(messages)
+        return b"".join([self._bytes(message) for message in messages])
 
     def _bytes(self, message: Message) -> bytes:
         if self.slow and (type(message) is Feedback or (type(message) is Event and not message.number)):

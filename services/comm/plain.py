@@ -37,7 +37,7 @@ def plain(value: Any, where: str = "value") -> Any:
     Done by the sender, so that a value is refused where it was made and both ends see the same types whether they live in
     one process or in two. `where` names the data in the error. Raises NotPlainError.
     """
-    return _plain(value, where, DEPTH)
+    return _plain_dict(value, where, DEPTH) if type(value) is dict else _plain(value, where, DEPTH)
 
 
 def _plain(value: Any, where: str, depth: int) -> Any:

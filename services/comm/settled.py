@@ -10,6 +10,9 @@ from services.comm.messages import ResultAck
 REMEMBERED: Final = 10_000
 """Ids of ended calls that are remembered at least."""
 ACKS_AT_ONCE: Final = 64
+"""Acknowledgements that wait no longer for others."""
+IN_ONE: Final = 200
+"""Most of them in one message: so many of the longest ids keep to its limit."""
 
 _NEVER: Final = float("inf")
 
@@ -54,23 +57,23 @@ class Settled:
         self._given_up.pop(id_, None)
         self.end(id_, True)
 
-    def acknowledge(self, now: float, id_: str) -> None:
-        """Tell the peer soon that this result is safe."""
-        safe = self._safe
-        safe[id_] = True
+    def acknowledge(self, now: float, *ids: str) -> None:
+        """Tell the peer soon that these results are safe."""
+        safe, acks = self._safe, self._acks
+        if not acks:
+            self.due = now + self._delay
+        for id_ in ids:
+            safe[id_] = True
+        acks += ids
         if len(safe) > 2 * REMEMBERED:
             self._prune()
-        if not self._acks:
-            self.due = now + self._delay
-        self._acks.append(id_)
-        if len(self._acks) >= ACKS_AT_ONCE:
+        if len(acks) >= ACKS_AT_ONCE:
             self.due = now
 
-    def take_acks(self) -> ResultAck | None:
-        """The acknowledgement of all that wait. To be asked for once it is `due`."""
-        acks = self._acks
-        self._acks, self.due = [], _NEVER
-        return ResultAck(acks[0], tuple(acks[1:])) if acks else None
+    def take_acks(self) -> list[ResultAck]:
+        """The acknowledgements of all that wait. To be asked for once they are `due`."""
+        acks, self._acks, self.due = self._acks, [], _NEVER
+        return [ResultAck(acks[n], tuple(acks[n + 1 : n + IN_ONE])) for n in range(0, len(acks), IN_ONE)]
 
     def link_lost(self) -> None:
         """What waits is not told any more: the peer lists what it keeps when it is back."""

@@ -14,7 +14,7 @@ leaves it.
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -102,6 +102,18 @@ class Connection:
         if self._seal_out is not None:
             return (len(body) + SEAL_BYTES).to_bytes(_HEADER, "big") + body + self._seal_out.next(body)
         return len(body).to_bytes(_HEADER, "big") + body
+
+    def send_all(self, messages: Sequence[Message]) -> bytes:
+        """Bytes of messages that may all go and end nothing. Raises as `send`; then nothing has changed."""
+        if any(message.KIND not in self._quick_out for message in messages):
+            raise ProtocolError("out_of_turn", "these messages have to be sent one by one")
+        parts: list[bytes] = []
+        for body in [encode(message) for message in messages]:
+            parts.append((len(body) + self._seal_bytes).to_bytes(_HEADER, "big"))
+            parts.append(body)
+            if self._seal_out is not None:
+                parts.append(self._seal_out.next(body))
+        return b"".join(parts)
 
     def _send_unusual(self, message: Message) -> bytes:
         if message.KIND not in self._may_go:

@@ -17,6 +17,7 @@ from services.comm.caller import (
     PeerLost,
     Progress,
 )
+from services.comm.codec import LIMITS, encode
 from services.comm.messages import Executed
 from services.comm.plain import NotPlainError
 
@@ -193,6 +194,20 @@ def test_a_cancelled_call_that_never_ends_is_given_up() -> None:
     caller.notices()
     caller.advance(6.0)
     assert _ends(caller.notices()) == [("1", "no_answer", Executed.UNKNOWN)]
+
+
+def test_very_many_results_at_once_are_acknowledged_in_messages_that_may_be_sent() -> None:
+    caller = _caller()
+    ids = [f"{n:0255}" for n in range(1_000)]
+    ended: list[str] = []
+    for id_ in ids:
+        caller.begin(0.0, id_, "get", {}, done=lambda outcome: ended.append(outcome.id))
+    caller.messages(0.0)
+    caller.take_outcomes(0.1, [m.Outcome(id_, "success") for id_ in (*ids, ids[0])])
+    acks = [message for message in caller.messages(0.1) if isinstance(message, m.ResultAck)]
+    assert ended == ids, "each once, also one that came twice"
+    assert [id_ for ack in acks for id_ in (ack.id, *ack.more)] == ids
+    assert all(len(encode(ack)) <= LIMITS[m.ResultAck.KIND] for ack in acks)
 
 
 def test_the_owner_says_how_long_stopping_may_take() -> None:

@@ -56,6 +56,24 @@ def test_any_cutting_gives_the_same_messages(data: st.DataObject, sealed: bool) 
     assert received == sent
 
 
+@given(st.lists(SPOKEN, max_size=6), st.booleans())
+def test_several_at_once_are_the_bytes_of_each(sent: list[m.Message], sealed: bool) -> None:
+    (one, server), (other, _) = [new_pair(KEY if sealed else None) for _ in range(2)]
+    greet(one, server)
+    greet(other, new_pair(KEY if sealed else None)[1])
+    together = one.send_all(sent)
+    assert together == b"".join(other.send(message) for message in sent)
+    assert server.receive_data(together) == sent
+
+
+def test_several_of_which_one_may_not_go_change_nothing(open_pair: Pair, key: bytes | None) -> None:
+    client, server = open_pair(key)
+    for bad in (m.Bye(), m.Welcome(1, "x", "y"), m.Cancel("1", "x" * LIMITS[m.Cancel.KIND])):
+        with pytest.raises(ProtocolError):
+            client.send_all([m.Ping(1), bad])
+    assert server.receive_data(client.send_all([m.Ping(2)])) == [m.Ping(2)]
+
+
 def test_byte_by_byte_handshake_and_call(key: bytes | None, pair: Pair) -> None:
     client, server = pair(key)
     towards_server, towards_client = client.send(HELLO), b""
