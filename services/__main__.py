@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from services.comm.directory import Directory, DirectoryError, parse, verify_imports
+from services.comm.directory import COORDINATOR, Directory, DirectoryError, parse, verify_imports
 from services.comm.directory_file import nearest
 from services.comm.lockstep import CellError, Delays, Member
 from services.comm.security import KeyFileError, KeyNeededError, read_key
@@ -33,6 +33,13 @@ def parser() -> argparse.ArgumentParser:
     commands.add_argument("name", help="the node's name in services.toml")
     commands.add_argument("--services", metavar="FILE", type=Path, default=Path("services.toml"), help="location file")
     commands.add_argument("--lockstep", action="store_true", help="be a member of a lock-step cell")
+    commands.add_argument(
+        "--await-coordinator",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="lock step: wait so long for a coordinator that died and is resumed (s of wall time)",
+    )
     commands.add_argument("--mock", metavar="FILE", default="", help="replace the actions that this file scripts")
     return commands
 
@@ -54,12 +61,24 @@ def read(path: Path, name: str) -> tuple[Directory, str]:
     return directory, text
 
 
-def run_lockstep(directory: Directory, name: str, mock: str) -> None:
-    """Be a member of a lock-step cell of one process a node, until one of them ends it."""
+def run_lockstep(directory: Directory, name: str, mock: str, awaited: float) -> None:
+    """Be a member of a lock-step cell of one process a node, until one of them ends it.
+
+    `awaited`: seconds (wall time) that a coordinator which died may take to come back; 0: it is not waited for.
+    """
     node = LockstepNode(directory, name, substitutes=load_script(mock) if mock else None)
     key = read_key(directory.file(directory.keys["file"])) if "file" in directory.keys else None
     delays = Delays(directory.delays())
-    member = Member(name, [node], directory.members(), delays=delays, directory=directory.hash, key=key)
+    member = Member(
+        name,
+        [node],
+        directory.members(),
+        delays=delays,
+        directory=directory.hash,
+        key=key,
+        returning={COORDINATOR} if awaited else (),
+        absence=awaited,
+    )
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     print(f"node {name} ready for lock step, process {os.getpid()}", flush=True)
     try:
@@ -77,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.mock:
             load_script(options.mock)
         if options.lockstep:
-            run_lockstep(directory, options.name, options.mock)
+            run_lockstep(directory, options.name, options.mock, options.await_coordinator)
         else:
             memory = directory.nodes[options.name].worker_memory_mb << 20
             asyncio.run(serve(directory, options.name, text, mock=options.mock, memory=memory))

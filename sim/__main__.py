@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from services.comm.directory import Directory, DirectoryError, load, resolve
+from services.comm.directory import COORDINATOR, Directory, DirectoryError, load, resolve
 from services.comm.lockstep import CellError, Delays, Member
 from services.comm.security import KeyFileError, KeyNeededError, read_key
 from sim.realtime import serve
@@ -29,6 +29,13 @@ def parser() -> argparse.ArgumentParser:
     )
     commands.add_argument("--services", metavar="FILE", type=Path, default=Path("services.toml"), help="location file")
     commands.add_argument("--lockstep", action="store_true", help="be a member of a lock-step cell")
+    commands.add_argument(
+        "--await-coordinator",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="lock step: wait so long for a coordinator that died and is resumed (s of wall time)",
+    )
     return commands
 
 
@@ -45,12 +52,24 @@ def read(path: Path) -> tuple[Directory, str]:
     return directory, name
 
 
-def run_lockstep(directory: Directory, name: str) -> None:
-    """Be a member of a lock-step cell of one process a node, until one of them ends it."""
+def run_lockstep(directory: Directory, name: str, awaited: float) -> None:
+    """Be a member of a lock-step cell of one process a node, until one of them ends it.
+
+    `awaited`: seconds (wall time) that a coordinator which died may take to come back; 0: it is not waited for.
+    """
     laboratory = resolve(directory.nodes[name].sim)(directory, name)
     key = read_key(directory.file(directory.keys["file"])) if "file" in directory.keys else None
     delays = Delays(directory.delays())
-    member = Member(name, [laboratory], directory.members(), delays=delays, directory=directory.hash, key=key)
+    member = Member(
+        name,
+        [laboratory],
+        directory.members(),
+        delays=delays,
+        directory=directory.hash,
+        key=key,
+        returning={COORDINATOR} if awaited else (),
+        absence=awaited,
+    )
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     print(f"node {name} ready for lock step, process {os.getpid()}", flush=True)
     try:
@@ -66,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         directory, name = read(options.services)
         if options.lockstep:
-            run_lockstep(directory, name)
+            run_lockstep(directory, name, options.await_coordinator)
         else:
             asyncio.run(serve(directory, name))
     except (DirectoryError, LaboratoryError, KeyNeededError, KeyFileError, ImportError, ValueError, OSError) as fault:

@@ -6,6 +6,11 @@ work, and nobody waits for an answer. A peer that is silent for `patience` secon
 
 The cell ends when one member says Bye instead of its Tick k: everybody has then run the ticks up to k, no more, as in one
 process.
+
+A member in `returning` may be lost and come back as another process (a coordinator that is resumed): the others wait for it
+where they stand. They may differ by a tick, since it can have been killed between two of its Ticks. Each tells the new process
+the last Tick that it has sent; that one gives the missing marks, empty, and goes on behind the newest. What was on its way to the
+dead process is lost, as with any broken connection: the node protocol says it again.
 """
 
 from __future__ import annotations
@@ -15,14 +20,14 @@ import secrets
 import select
 import socket
 import time
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Final
 
 from services.comm.cell import Cell, CellError, Delays, Half
 from services.comm.messages import Bye, Hello, Message, Refuse, Tick, Welcome
 from services.comm.party import Party, Posted
 from services.comm.security import NONCE_BYTES, require_key
+from services.comm.tick_link import PartyLostError, TickLink, family, handshake, tune
 from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION, Connection, ProtocolError, Side
 
 __all__ = ["Cell", "CellError", "Delays", "Member", "PartyLostError", "TickLink"]
@@ -34,104 +39,13 @@ _LINGER: Final = 1.0
 """Seconds that an ended member waits for the others to have read its Bye."""
 
 
-class PartyLostError(CellError):
-    """A member of the cell is gone; `member` says which."""
-
-    def __init__(self, member: str, text: str) -> None:
-        super().__init__(f"{member}: {text}")
-        self.member = member
-
-
-class TickLink:
-    """The connection to one peer: Ticks out, Ticks in, in order. Never blocks."""
-
-    def __init__(self, peer: str, sock: socket.socket, connection: Connection, early: Sequence[Message] = ()) -> None:
-        sock.setblocking(False)
-        self.peer = peer
-        self.sock = sock
-        self.ended: str | None = None
-        """Text of the peer's Bye: who ended the cell and why."""
-        self._connection = connection
-        self._unsent = bytearray()
-        self._ticks: deque[Tick] = deque()
-        self._newest = -1
-        self._take(early)
-
-    @property
-    def unsent(self) -> bool:
-        """Whether bytes still wait for room in the socket."""
-        return bool(self._unsent)
-
-    def rest(self) -> bytes:
-        """Take out the bytes that still wait."""
-        rest = bytes(self._unsent)
-        self._unsent.clear()
-        return rest
-
-    def has(self, number: int) -> bool:
-        """Whether the peer's Tick of this number is in."""
-        return self._newest >= number
-
-    def pop(self) -> Tick:
-        """The oldest Tick not taken yet."""
-        return self._ticks.popleft()
-
-    def send(self, message: Message) -> None:
-        """Send a message, or as much of it as fits now; one that has ended is sent nothing more."""
-        if self.ended is not None:
-            return
-        self._unsent += self._connection.send(message)
-        self.flush()
-
-    def flush(self) -> None:
-        """Send what still waits. Raises PartyLostError if the peer is gone."""
-        try:
-            while self._unsent:
-                del self._unsent[: self.sock.send(self._unsent)]
-        except BlockingIOError:
-            pass
-        except OSError as fault:
-            raise PartyLostError(self.peer, f"its connection broke: {fault.strerror}") from None
-
-    def read(self) -> None:
-        """Take in what has arrived. Raises PartyLostError if the peer is gone, failed or broke the protocol."""
-        try:
-            data = self.sock.recv(_CHUNK)
-        except BlockingIOError:
-            return
-        except OSError as fault:
-            raise PartyLostError(self.peer, f"its connection broke: {fault.strerror}") from None
-        if not data:
-            if self.ended is None:
-                raise PartyLostError(self.peer, "its process ended without a word")
-            return
-        try:
-            self._take(self._connection.receive_data(data))
-        except ProtocolError as fault:
-            self._take(fault.before)
-            raise PartyLostError(self.peer, f"it broke the protocol: {fault}") from None
-
-    def _take(self, messages: Sequence[Message]) -> None:
-        for message in messages:
-            if isinstance(message, Tick):
-                if message.number != self._newest + 1:
-                    raise PartyLostError(self.peer, f"tick {message.number} came after tick {self._newest}")
-                self._newest = message.number
-                self._ticks.append(message)
-            elif isinstance(message, Bye):
-                self.ended = message.text
-            elif isinstance(message, Refuse):
-                raise PartyLostError(self.peer, message.text)
-            else:
-                raise PartyLostError(self.peer, f"a {type(message).__name__} has no place in lock step")
-
-
 class Member:
     """One process of a lock-step cell. `addresses` (host, port) name all members, this one too; `name` is among them.
 
     `hosts` says which member each party of the cell lives in; without it each member is one party of its own name.
     `directory` (hash of services.toml) must be the same in all. `patience` is how long a mark may be
     missing, `joining` how long members may take to come together (s of wall time; importing takes some on a busy host).
+    Members in `returning` may be away for `absence` (s of wall time); one that comes back itself `rejoins`.
     """
 
     def __init__(
@@ -147,6 +61,9 @@ class Member:
         patience: float = 10.0,
         joining: float = 60.0,
         listener: socket.socket | None = None,
+        returning: Collection[str] = (),
+        absence: float = 600.0,
+        rejoins: bool = False,
     ) -> None:
         self.name = name
         self.tick = 0
@@ -160,6 +77,9 @@ class Member:
         self._joining = joining
         self._listener = listener
         self._links: dict[str, TickLink] = {}
+        self._returning = frozenset(returning) - {name}
+        self._absence = absence
+        self._rejoins = rejoins
         self._boot = secrets.token_hex(8)
 
     # Coming together.
@@ -185,13 +105,18 @@ class Member:
             self._abandon("it could not join the cell")
             raise
         finally:
-            listener.close()
+            if any(peer > self.name for peer in self._returning):
+                self._listener = listener
+            else:
+                listener.close()
+        if self._rejoins:
+            self._find_place(deadline)
 
     def _listen(self) -> socket.socket:
         host, port = self._addresses[self.name]
         require_key(self.name, host, self._key)
         try:
-            return socket.create_server((host, port), family=_family(host), backlog=len(self._addresses))
+            return socket.create_server((host, port), family=family(host), backlog=len(self._addresses))
         except OSError as fault:
             raise CellError(f"{self.name}: cannot listen on {host}:{port}: {fault.strerror}") from None
 
@@ -199,7 +124,38 @@ class Member:
         nonce = secrets.token_bytes(NONCE_BYTES) if self._key is not None else b""
         return Connection(side, key=self._key, nonce=nonce)
 
-    def _reach(self, peer: str, deadline: float) -> TickLink:
+    def _find_place(self, deadline: float) -> None:
+        """Join a cell that goes on: hear where everybody is, give the missing marks, go on behind the newest."""
+        while missing := [link for link in self._links.values() if link.newest is None]:
+            self._wait(missing, deadline)
+        last = {link.peer: link.newest for link in self._links.values() if link.newest is not None}
+        self.tick = max(last.values()) + 1
+        for peer, link in self._links.items():
+            for number in range(last[peer], self.tick):
+                link.send(Tick(number))
+
+    def _readmit(self, peer: str) -> None:
+        """A member that may return is gone: wait for it, and tell it the last tick that was sent from here."""
+        lost = self._links.pop(peer)
+        lost.sock.close()
+        deadline = time.monotonic() + self._absence
+        link = None
+        while link is None:
+            try:
+                if peer < self.name:
+                    link = self._reach(peer, deadline, lost)
+                elif self._listener is not None:
+                    link = self._admit(self._listener, {peer}, deadline, lost)
+                if link is not None:
+                    link.send(Tick(self.tick - 1))
+            except PartyLostError:
+                link = None  # it was gone again before it had come
+                if time.monotonic() + _RETRY >= deadline:
+                    raise
+                time.sleep(_RETRY)
+        self._links[peer] = link
+
+    def _reach(self, peer: str, deadline: float, before: TickLink | None = None) -> TickLink:
         host, port = self._addresses[peer]
         while True:
             try:
@@ -209,37 +165,39 @@ class Member:
                 if time.monotonic() + _RETRY >= deadline:
                     raise PartyLostError(peer, f"nobody answers on {host}:{port}: {fault}") from None
                 time.sleep(_RETRY)
-        _tune(sock)
+        tune(sock)
         connection = self._connection(Side.CLIENT)
         hello = Hello(OLDEST_VERSION, NEWEST_VERSION, "party", self.name, self._boot, 0, self._directory)
         try:
-            early = _handshake(sock, connection, hello, deadline)
+            early = handshake(sock, connection, hello, deadline)
         except (OSError, ProtocolError) as fault:
             sock.close()
             raise PartyLostError(peer, f"no lock step with {host}:{port}: {fault}") from None
         answer = early[0]
         if isinstance(answer, Welcome) and answer.name == peer:
-            return TickLink(peer, sock, connection, early[1:])
+            return TickLink(peer, sock, connection, early[1:], before=before, joins=self._rejoins)
         sock.close()
         text = answer.text if isinstance(answer, Refuse) else f"it is not {peer} that listens on {host}:{port}"
         raise CellError(f"{peer}: {text}")
 
-    def _admit(self, listener: socket.socket, after: set[str], deadline: float) -> TickLink | None:
+    def _admit(
+        self, listener: socket.socket, after: set[str], deadline: float, before: TickLink | None = None
+    ) -> TickLink | None:
         """The next member that connects; None if it was a stranger."""
         listener.settimeout(max(deadline - time.monotonic(), 0.001))
         try:
             sock, _ = listener.accept()
         except TimeoutError:
             raise PartyLostError(min(after), f"it did not join the cell in {self._joining:g} s") from None
-        _tune(sock)
+        tune(sock)
         connection = self._connection(Side.SERVER)
         try:
-            hello = _handshake(sock, connection, None, min(deadline, time.monotonic() + 1.0))[0]
+            hello = handshake(sock, connection, None, min(deadline, time.monotonic() + 1.0))[0]
             refusal = self._refusal(hello, after)
             if refusal is None and isinstance(hello, Hello):
                 welcome = Welcome(NEWEST_VERSION, self.name, self._boot, directory=self._directory)
                 sock.sendall(connection.send(welcome))
-                return TickLink(hello.name, sock, connection)
+                return TickLink(hello.name, sock, connection, before=before, joins=self._rejoins)
             sock.sendall(connection.send(refusal or Refuse("malformed", "no HELLO")))
         except ProtocolError as fault:
             with contextlib.suppress(OSError):
@@ -291,11 +249,15 @@ class Member:
             sent.setdefault(self._hosts[posted.envelope.party], []).append(posted)
         for peer, link in self._links.items():
             envelopes = sent.get(peer)
-            link.send(Tick(number, tuple(envelopes)) if envelopes else Tick(number))
+            try:
+                link.send(Tick(number, tuple(envelopes)) if envelopes else Tick(number))
+            except PartyLostError:
+                if peer not in self._returning:
+                    raise  # else it is missed, and waited for, when its own Tick is due
 
     def _gather(self, number: int) -> str | None:
         """Wait for every peer's Tick of this number and deliver it; gives why the cell has ended, if it has."""
-        deadline = time.monotonic() + self._patience
+        deadline = time.monotonic() + (self._absence if self._returning else self._patience)
         links = self._links.values()
         while True:
             missing = [link for link in links if not link.has(number)]
@@ -306,27 +268,34 @@ class Member:
                 break
             self._wait(missing, deadline)
         for link in links:
-            self._deliver(link.peer, link.pop())
+            self._deliver(link.peer, link.pop(number))
         return None
 
     def _wait(self, missing: Sequence[TickLink], deadline: float) -> None:
         """Block until a socket has something to read, or room for what is still to go out."""
         poll = select.poll()
         by_number = {link.sock.fileno(): link for link in self._links.values()}
-        for link in missing:
-            poll.register(link.sock, select.POLLIN)
+        for link in self._links.values():
+            if link in missing or link.peer in self._returning:
+                poll.register(link.sock, select.POLLIN)
         for number, link in by_number.items():
             if link.unsent:
                 poll.register(number, select.POLLIN | select.POLLOUT)
         ready = poll.poll(max(deadline - time.monotonic(), 0.0) * 1000.0)
         if not ready:
-            raise PartyLostError(missing[0].peer, f"no end of tick {self.tick - 1} for {self._patience:g} s: lost")
+            patience = self._absence if self._returning else self._patience
+            raise PartyLostError(missing[0].peer, f"no end of tick {self.tick - 1} for {patience:g} s: lost")
         for number, what in ready:
             link = by_number[number]
-            if what & select.POLLOUT:
-                link.flush()
-            if what & ~select.POLLOUT:
-                link.read()
+            try:
+                if what & select.POLLOUT:
+                    link.flush()
+                if what & ~select.POLLOUT:
+                    link.read()
+            except PartyLostError:
+                if link.peer not in self._returning:
+                    raise
+                self._readmit(link.peer)
 
     def _deliver(self, peer: str, tick: Tick) -> None:
         for posted in tick.envelopes:
@@ -362,27 +331,5 @@ class Member:
                     pass
             link.sock.close()
         self._links.clear()
-
-
-def _family(host: str) -> socket.AddressFamily:
-    return socket.AF_INET6 if ":" in host else socket.AF_INET
-
-
-def _tune(sock: socket.socket) -> None:
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-
-
-def _handshake(sock: socket.socket, connection: Connection, hello: Hello | None, deadline: float) -> list[Message]:
-    """Blocking: say HELLO if this side begins, go on until the other side has said something for the owner."""
-    if hello is not None:
-        sock.sendall(connection.send(hello))
-    while True:
-        sock.settimeout(max(deadline - time.monotonic(), 0.001))
-        data = sock.recv(_CHUNK)
-        if not data:
-            raise ConnectionError("the other side hung up")
-        messages = connection.receive_data(data)
-        if out := connection.data_to_send():
-            sock.sendall(out)
-        if messages:
-            return messages
+        if self._listener is not None:
+            self._listener.close()
