@@ -25,6 +25,7 @@ from sim.track_plan import floor_plan, summary
 
 Picture = NDArray[np.uint8]
 
+ROVER_FILE: Final = Path(__file__).parents[1] / "services" / "mobile" / "rover.toml"
 WIDTH: Final = 640
 """px, of the film's greater side."""
 _PATH, _ROVER, _REFLECTOR = (15, 72, 217), (230, 120, 30), (59, 212, 255)
@@ -165,7 +166,7 @@ def parser() -> argparse.ArgumentParser:
     )
     commands.add_argument("--film", type=Path, metavar="FILE", help="write the film (.webm, .mp4, .avi, .gif, .webp)")
     commands.add_argument("--speedup", type=float, default=4.0, help="how many times as fast as the run was (4)")
-    commands.add_argument("--rover", type=Path, default=Path("services/mobile/rover.toml"), help="the rover's numbers")
+    commands.add_argument("--rover", type=Path, default=ROVER_FILE, help="the rover's numbers (the shipped ones)")
     return commands
 
 
