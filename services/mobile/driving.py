@@ -24,12 +24,16 @@ TAKE_OVER: Final = 0.34
 """m before the end of the line at which following has done its part: what comes next begins on the move."""
 BEYOND: Final = 0.6
 """m that a plan goes on straight where the track should have been found."""
+ROLLED: Final = 0.3
+"""m that must have been followed for a line to count as one that has ceased."""
 STUCK: Final = 0.5
 """s of standing without a line after which it counts as lost."""
 NEAR_GATE: Final = 0.40
 """m off where a track can resume within which a reflector is taken to mark it."""
 REFLECTOR_PATIENCE: Final = 1.2
 """s that a reflector is waited for at the line's end."""
+LOOKS: Final = ((0.8, (0.0, 1.4, -1.4, 0.7, -0.7)), (0.2, (0.0, 0.8, -0.8)))
+"""Where a search looks around: m beyond the line's end, and headings against it (rad)."""
 LOOK: Final = 0.35
 """s of looking after each turn of a search."""
 STANDS_FOR: Final = 0.6
@@ -115,7 +119,7 @@ async def dead_reckon(
 async def search_pattern(
     ctx: Context, *, line_end: Sequence[float], speed: float = 0.4, rate: float = 1.2, timeout: float = 60.0
 ) -> Result:
-    """Recover the track by going to the middle of the empty square and looking straight on, to the left and to the right.
+    """Recover the track by going into the empty square and looking straight on, to the left and to the right.
 
     Needs no sensor and no guess, and finds the way back from a wrong guess; takes longest. See `_recover`.
     """
@@ -124,12 +128,13 @@ async def search_pattern(
     stuck = await drive.start(gates)
     if stuck is not None:
         return stuck
-    middle = Pose(*end.floor(0.8 * nominal_rover().track.radius, 0.0), end.heading)
-    ended = await _go(drive, middle, rate)
-    for turn in (0.0, 1.4, -1.4, 0.7, -0.7):
-        if ended is not None:
-            return ended
-        ended = await _look(drive, turned(middle.heading + turn), rate)
+    for ahead, turns in LOOKS:
+        place = Pose(*end.floor(ahead, 0.0), end.heading)
+        ended = await _go(drive, place, rate)
+        for turn in turns:
+            if ended is not None:
+                return ended
+            ended = await _look(drive, turned(place.heading + turn), rate)
     return ended or failure("no_track", "the track is not where it can resume", recovered=False)
 
 
@@ -165,7 +170,7 @@ async def _follow(ctx: Context, law: str, speed: float, timeout: float, patience
     `stale_set_point` when the stream ceased, or as the driver says.
     """
     drive = _Drive(ctx, law, speed, timeout)
-    begun = ctx.now
+    begun, way = ctx.now, ctx.device.state["way"]
     lost: dict[str, float] = {}
 
     def judge(state: Mapping[str, Any]) -> Result | None:
@@ -178,7 +183,8 @@ async def _follow(ctx: Context, law: str, speed: float, timeout: float, patience
         since = lost.setdefault(why, ctx.now)
         if why == "stale" and ctx.now - since > max(STUCK, min(patience, 1.0)) and ctx.now - begun > patience:
             return error("stale_set_point", f"the stream of sights has ceased for {ctx.now - since:.1f} s")
-        if why == "no_line" and state["sights"] and state["line_end"] is not None and ctx.now - since > STUCK:
+        rolled = state["way"] - way > ROLLED
+        if why == "no_line" and rolled and state["line_end"] is not None and ctx.now - since > STUCK:
             return failure("unannounced_end", "the line ceased", at_t=False, line_end=list(state["line_end"]))
         if ctx.now - begun > patience and ctx.now - since > STUCK:
             return error("no_line", f"no line to follow for {ctx.now - since:.1f} s")
@@ -240,29 +246,31 @@ async def _go(drive: _Drive, to: Pose, rate: float) -> Result | None:
     return None if ended.cause == "arrived" else ended
 
 
-async def _turn(drive: _Drive, heading: float, rate: float) -> Result | None:
-    """Turn on the spot to a heading (rad, odometry frame); None when done, else how the run ends."""
+async def _turn(drive: _Drive, heading: float, rate: float, *, look: bool = False) -> Result | None:
+    """Turn on the spot to a heading (rad, odometry frame), with `look` until the track is seen; None when done."""
     ended = await drive.until(
-        lambda state: success() if state["reason"] == "arrived" and state["mode"] == "turn" else None,
+        lambda state: success() if _turned(state) or (look and state["sights"] > 1) else None,
         min(8.0, drive.left()),
         {"do": "turn", "to": heading, "rate": rate},
     )
     return ended if ended.cause else None
 
 
+def _turned(state: Mapping[str, Any]) -> bool:
+    return bool(state["reason"] == "arrived" and state["mode"] == "turn")
+
+
 async def _look(drive: _Drive, heading: float, rate: float) -> Result | None:
     """Turn to a heading and look; drive to the track if it is there. None when it is not."""
     ctx = drive.ctx
-    ended = await _turn(drive, heading, rate)
+    ended = await _turn(drive, heading, rate, look=True)
     if ended is not None:
         return ended
     await ctx.wait(lambda: ctx.device.state["sights"] > 0, LOOK)
     state = ctx.device.state
-    if not state["sights"] or state["view"] is None:
+    if not state["sights"]:
         return None
-    x, y, fx, fy = state["view"]
-    there = Pose(x, y, math.atan2(fy - y, fx - x))
-    await _command(ctx, {"do": "plan", "points": paths.join(Pose(*state["pose"]), there, 0.0)})
+    await _command(ctx, {"do": "plan", "points": paths.join(Pose(*state["pose"]), Pose(*state["entry"]), 0.0)})
     result = await drive.until(_recovered, min(15.0, drive.left()))
     return None if result.cause == "no_track" else result
 

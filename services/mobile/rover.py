@@ -71,8 +71,6 @@ class Rover:
         self._speed = self._turning = self._measured = 0.0
         self._set = (0.0, 0.0)
         self._taken = 0
-        self._view: TrackAhead | None = None
-        self._viewed_from = self._odometry.pose
         self._cycles = 0
         self._fits: dict[float, Fit | None] = {}
         self._commands: dict[str, Callable[[float, Mapping[str, Any]], None]] = {
@@ -129,7 +127,7 @@ class Rover:
             "on_line": fit is not None,
             "offset": 0.0 if fit is None else fit.y,
             "heading": 0.0 if fit is None else fit.heading,
-            "view": self._viewed(),
+            "entry": None if self._map.entry is None else tuple(self._map.entry),
             "sights": self._map.sights,
             "refused": self._map.refused,
             "stream_age": self._setpoint.age,
@@ -245,11 +243,10 @@ class Rover:
             return
         self._taken = setpoint.count
         try:
-            self._view = TrackAhead.parse(setpoint.values, setpoint.held)
+            view = TrackAhead.parse(setpoint.values, setpoint.held)
         except ValueError:
             return
-        self._viewed_from = self._odometry.at(now - self._view.age)
-        self._map.take(self._viewed_from, self._view)
+        self._map.take(self._odometry.at(now - view.age), view)
         self._fits.clear()
 
     def _drive(self, now: float) -> tuple[float, float]:
@@ -319,14 +316,6 @@ class Rover:
             self._fits[x] = self._map.fit(self._odometry.pose, x)
         return self._fits[x]
 
-    def _viewed(self) -> tuple[float, ...] | None:
-        """The newest sight for who looks for a lost track: the nearest point and one farther on (m, odometry frame)."""
-        view = self._view
-        if view is None or self._setpoint.values is None or len(view.points) < 3:
-            return None
-        near, far = view.points[0], view.points[min(len(view.points) - 1, 6)]
-        return (*self._viewed_from.floor(*near), *self._viewed_from.floor(*far))
-
     def _line_end(self) -> tuple[float, float, float] | None:
         """Pose of the line where it is known to end; at rest, as far as it is known at all."""
         place = self._map.end_place
@@ -339,10 +328,10 @@ class Rover:
 
     def _regained(self) -> bool:
         """Whether a new stretch has been seen often and lies well before the rover."""
-        near = self._map.nearest_fresh
+        near = self._map.entry
         if not self._map.gated or self._map.sights < REGAINED_SIGHTS or near is None:
             return False
-        x, y = self._odometry.pose.body(*near)
+        x, y = self._odometry.pose.body(near.x, near.y)
         fit = self._map.fit(self._odometry.pose, max(0.2, x + 0.1))
         return x < REGAINED_AHEAD and abs(y) < REGAINED_ASIDE and fit is not None and abs(fit.heading) < REGAINED_TURN
 

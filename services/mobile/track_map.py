@@ -75,8 +75,8 @@ class TrackMap:
         """Sights in a row that did not fit what was known."""
         self.sights = 0
         """Sights taken since `begin`."""
-        self.nearest_fresh: tuple[float, float] | None = None
-        """The nearest point of the newest of them."""
+        self.entry: Pose | None = None
+        """The nearest point of the newest of them, and the line's direction from there."""
         self._local: tuple[Pose, tuple[Vector, Vector, Vector, int]] | None = None
         self._gates: tuple[Pose, ...] = ()
         self._looks = True
@@ -92,7 +92,7 @@ class TrackMap:
         no sight is taken until the next stretch begins.
         """
         self._ends.clear()
-        self.sights, self.refused, self.nearest_fresh = 0, 0, None
+        self.sights, self.refused, self.entry = 0, 0, None
         self._gates, self._looks = tuple(gates), look
 
     @property
@@ -119,7 +119,7 @@ class TrackMap:
             self._note_end(pose, ahead.end)
         self._see_instead_of_plan(pose, ahead.points)
         self.tip = pose.floor(*ahead.points[-1])
-        self.nearest_fresh = pose.floor(*ahead.points[0])
+        self.entry = _entry(pose, ahead.points)
         if self._nothing_new(pose):
             return False
         self._taken_at = pose
@@ -252,6 +252,12 @@ class TrackMap:
         found = x[keep], y[keep], points[keep, 2], int(number)
         self._local = (pose, found)
         return found
+
+
+def _entry(pose: Pose, points: Sequence[tuple[float, float]]) -> Pose:
+    """Where a line seen from a pose begins, and its direction over the first third of a metre."""
+    (x0, y0), (x1, y1) = points[0], points[min(len(points) - 1, 6)]
+    return Pose(*pose.floor(x0, y0), pose.heading + math.atan2(y1 - y0, x1 - x0))
 
 
 def _weighted(d: Vector, y: Vector, w: Vector, degree: int) -> Fit | None:

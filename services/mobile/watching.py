@@ -19,6 +19,8 @@ from services.mobile.sight import UNSEEN, End, Line, Sight, TrackEnd
 
 FOLLOW_FAR, FIND_FAR = 1.2, 1.5
 """m ahead up to which scan rows lie while the line is followed, and while it is looked for."""
+NEAR = 0.6
+"""m ahead within which a line must begin for the rows of following to suffice."""
 FORGET = 3
 """Images without a sight after which the line may begin anywhere again."""
 VOTES, NEEDED = 6, 3
@@ -52,7 +54,7 @@ class LineWatcher:
     def __init__(self, floor: FloorWatch, detector: Detector, *, find: bool = False) -> None:
         self._floor = floor
         self._detect = detector
-        self._grid = floor.wide if find else floor.near
+        self._find = find
         self._expected: Line | None = None
         self._votes: deque[TrackEnd] = deque(maxlen=VOTES)
         self.images = 0
@@ -78,7 +80,8 @@ class LineWatcher:
     def look(self, image: NDArray[np.uint8]) -> Sight:
         """What the image shows; its `end` is set only once it is believed."""
         self.images += 1
-        sight = self._detect(self._grid, self._grid.sample(image), self._floor.width, self._expected)
+        grid = self._floor.near if self._is_near and not self._find else self._floor.wide
+        sight = self._detect(grid, grid.sample(image), self._floor.width, self._expected)
         if not sight.seen:
             self.unseen += 1
             if self.unseen >= FORGET:
@@ -87,6 +90,11 @@ class LineWatcher:
         self.seen, self.unseen = self.seen + 1, 0
         self._expected = sight.describe()
         return replace(sight, end=self._believed(image, sight))
+
+    @property
+    def _is_near(self) -> bool:
+        """Whether the line begins where the image does: then rows far ahead tell nothing that matters yet."""
+        return self._expected is not None and self._expected.near < NEAR
 
     def _believed(self, image: NDArray[np.uint8], sight: Sight) -> End | None:
         end = self._floor.ends.judge(image, sight)
