@@ -464,29 +464,47 @@ def feed(data: bytes) -> None:
                 connection.receive_data(data)
 
 
-@given(st.binary(max_size=600), st.integers(0, 200))
+@given(st.binary(max_size=600), st.integers(0, 200), st.integers(0, 15))
 @settings(suppress_health_check=[HealthCheck.too_slow], deadline=None)
-def test_arbitrary_bytes_raise_nothing_but_protocol_error(data: bytes, kept: int) -> None:
+def test_arbitrary_bytes_raise_nothing_but_protocol_error(data: bytes, kept: int, which: int) -> None:
     """Alone, and after a good beginning."""
     feed(data)
-    feed((frame(STRANGE) + frame(m.Call("m/1", "echo")))[:kept] + data)
+    feed(beginnings()[which][:kept] + data)
+
+
+def beginnings() -> list[bytes]:
+    """Good conversations to begin from: HELLO, then one message of each kind that a client may send."""
+    said: list[m.Message] = [
+        m.Call("m/1", "echo", {"x": [1, 2.5, {"y": b"z"}]}, 2.0), m.ResultAck("m/1", ("m/2",)), m.Cancel("m/1", "why"),
+        m.EventAck("s", 3), m.Subscribe(("a", "b")), m.Command("c", "hold", "arm", {"run": "r"}), m.Ping(1), m.Tick(0),
+        m.StreamOpen("points", 0.02, "t"), m.SetPoint(1, (1.0, 2.0)), m.Withdraw(), m.Bye("x"), m.Refuse("c", "t"),
+    ]  # fmt: skip
+    back: list[m.Message] = [
+        m.Welcome(1, "v", "b", ("echo",)),
+        m.Challenge(bytes(32)),
+        m.Outcome("m/1", "success", {"n": 1}),
+    ]
+    return [frame(STRANGE) + frame(one) for one in said] + [frame(one) for one in back]
 
 
 FUZZ = """
-import sys
+import sys, pathlib
 sys.path.insert(0, {root!r})
 import atheris
 with atheris.instrument_imports(include=["services.comm"]):
-    from tests.doors.test_attacks import feed
-atheris.Setup([sys.argv[0], "-max_total_time=180", "-max_len=4096", "-rss_limit_mb=1024"], feed)
+    from tests.doors.test_attacks import beginnings, feed
+for number, data in enumerate(beginnings()):
+    pathlib.Path({corpus!r}, str(number)).write_bytes(data)
+limits = ["-max_total_time={seconds}", "-max_len=4096", "-rss_limit_mb=1024"]
+atheris.Setup([sys.argv[0], {corpus!r}, *limits], feed)
 atheris.Fuzz()
 """
 
 
 @pytest.mark.proof
-def test_coverage_guided_bytes_for_minutes() -> None:
+def test_coverage_guided_bytes_for_minutes(tmp_path: Path) -> None:
     """Three minutes of atheris, where it is installed: it looks for bytes that reach new code."""
     pytest.importorskip("atheris")
-    root = str(Path(__file__).resolve().parents[2])
-    done = subprocess.run([sys.executable, "-c", FUZZ.format(root=root)], capture_output=True, text=True, check=False)
+    script = FUZZ.format(root=str(Path(__file__).resolve().parents[2]), corpus=str(tmp_path), seconds=180)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import io
 import resource
 import socket
@@ -11,9 +12,13 @@ from typing import Any
 import aiohttp
 import pytest
 
+from coordinator.hmi import requests
 from coordinator.hmi.doors import HEADERS, is_loopback, names_for
+from coordinator.hmi.feeds import CLIENTS
 from coordinator.hmi.gate import CONNECTIONS, Gate
+from coordinator.hmi.port import PROTOCOL
 from coordinator.hmi.server import Page, start_page
+from coordinator.hmi.sessions import LARGEST_MESSAGE
 from tests.hmi.stage import Stage
 
 EVIL = "http://evil.example"
@@ -246,3 +251,66 @@ async def test_each_server_draws_its_own_token(stage: Stage, tasks: Any) -> None
     finally:
         await one.close()
         await two.close()
+
+
+@pytest.mark.parametrize("path", ["/", "/page/index.html", "/page/js/main.js", "/api/tasks", "/api/runs", "/api/check"])
+async def test_without_the_page_only_the_protocol_is_served(stage: Stage, tasks: Any, path: str) -> None:
+    """`--no-page` leaves no file and no document within reach, even with the token; commands go on."""
+    bare = await start_page(stage, tasks_folder=tasks, page=False)
+    try:
+        assert (await ask(bare, path, headers=bearer(bare))).status == 404
+        assert (await ask(bare, "/api/snapshot", headers=bearer(bare))).status == 200
+        assert (await ask(bare, "/api/snapshot")).status == 401
+        answer = await ask(bare, "/api/command", "POST", headers=bearer(bare), json={"verb": "take_controls"})
+        assert answer.status == 200
+    finally:
+        await bare.close()
+
+
+@pytest.mark.parametrize("size", [LARGEST_MESSAGE + 1, 8 * LARGEST_MESSAGE])
+async def test_an_oversized_message_ends_its_connection_alone(page: Page, size: int) -> None:
+    """It is not even taken in whole; another client goes on."""
+    hello = {"type": "hello", "protocol": PROTOCOL, "name": "ana", "tab": "1"}
+    async with aiohttp.ClientSession(headers=bearer(page)) as http:
+        async with http.ws_connect(base(page) + "/api/live") as good, http.ws_connect(base(page) + "/api/live") as bad:
+            for socket in (good, bad):
+                await socket.send_json(hello)
+                assert (await socket.receive_json(timeout=5))["type"] == "snapshot"
+            with contextlib.suppress(ConnectionError):
+                await bad.send_str("x" * size)
+            async with asyncio.timeout(5):
+                while not bad.closed:
+                    await bad.receive()
+            assert bad.close_code in (aiohttp.WSCloseCode.MESSAGE_TOO_BIG, aiohttp.WSCloseCode.ABNORMAL_CLOSURE)
+            await good.send_json({"type": "command", "id": 1, "verb": "take_controls"})
+            async with asyncio.timeout(5):
+                while (await good.receive_json())["type"] != "answer":
+                    pass
+
+
+async def test_clients_are_bounded_and_commands_still_come_in(page: Page) -> None:
+    """One more than there is room for is told so; a script's emergency stop needs no seat."""
+    hello = {"type": "hello", "protocol": PROTOCOL, "name": "ana", "tab": "1"}
+    async with aiohttp.ClientSession(headers=bearer(page), connector=aiohttp.TCPConnector(limit=0)) as http:
+        seats = [await http.ws_connect(base(page) + "/api/live") for _ in range(CLIENTS)]
+        for socket in seats:
+            await socket.send_json(hello)
+        with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+            await http.ws_connect(base(page) + "/api/live")
+        assert refused.value.status == 503
+        async with http.post(base(page) + "/api/command", json={"verb": "estop", "name": "ana"}) as answer:
+            assert answer.status == 200
+        for socket in seats:
+            await socket.close()
+
+
+async def test_a_body_that_never_ends_is_given_up(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A command whose body drips in does not hold its handler for ever."""
+    monkeypatch.setattr(requests, "BODY_S", 0.2)
+    reader, writer = await asyncio.open_connection("127.0.0.1", port_of(page))
+    head = f"POST /api/command HTTP/1.1\r\nHost: 127.0.0.1:{port_of(page)}\r\nAuthorization: Bearer {page.token}\r\n"
+    writer.write((head + "Content-Type: application/json\r\nContent-Length: 100\r\n\r\n{").encode())
+    answer = await asyncio.wait_for(reader.readline(), 5)
+    assert b"408" in answer
+    writer.close()
+    await writer.wait_closed()

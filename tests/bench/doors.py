@@ -1,0 +1,152 @@
+"""What attacks cost a node: its memory, and how long a good client's calls take meanwhile.
+
+    python tests/bench/doors.py
+    python tests/bench/doors.py --json out.json
+
+The server is a process of its own, the attackers are others (for connections) or this one. *Grown* is by how much the server's
+largest resident set (VmHWM) exceeds that of its start. The good client calls every millisecond, from this process, which is also
+busy attacking: its times are upper bounds, and ratios to the calm row are what counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import json
+import os
+import resource
+import sys
+import tempfile
+import time
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from coordinator.certificates import make_certificates
+from services.comm import messages as m
+from services.comm.client import Client
+from tests.doors.conftest import KEY, MIB, Stranger, Victim, frame
+from tests.doors.test_attacks import STRANGE, _bombard, _flood, crowd_at
+
+CROWD = 10_000
+LEAST = 200
+"""Calls of the good client in each row, if the attack is over before."""
+Attack = Callable[[Victim], contextlib.AbstractAsyncContextManager[None]]
+
+
+def quantile(values: list[float], q: float) -> float:
+    """The q-quantile of what was measured."""
+    ordered = sorted(values)
+    return ordered[min(int(q * len(ordered)), len(ordered) - 1)]
+
+
+async def times(client: Client, until: Callable[[int], bool]) -> list[float]:
+    """How long calls take, one each millisecond (s)."""
+    took: list[float] = []
+    while not until(len(took)):
+        begun = time.monotonic()
+        outcome = await client.call("echo", {"n": len(took)})
+        if outcome.status != "success":
+            raise RuntimeError(f"the good client was not served: {outcome}")
+        took.append(time.monotonic() - begun)
+        await asyncio.sleep(0.001)
+    return took
+
+
+@contextlib.asynccontextmanager
+async def nothing(server: Victim) -> AsyncIterator[None]:
+    """No attack."""
+    done = asyncio.create_task(asyncio.sleep(2.0))
+    yield
+    await done
+
+
+@contextlib.asynccontextmanager
+async def connections(server: Victim) -> AsyncIterator[None]:
+    """Ten thousand connections of another process."""
+    async with crowd_at(server, CROWD) as crowd:
+        opened = asyncio.create_task(asyncio.to_thread(crowd.stdout.readline))
+        yield
+        await opened
+
+
+@contextlib.asynccontextmanager
+async def noise(server: Victim) -> AsyncIterator[None]:
+    """A thousand connections full of random bytes."""
+    done = asyncio.gather(*(_bombard(server, lambda n: n >= 250, seed) for seed in range(4)))
+    yield
+    await done
+
+
+@contextlib.asynccontextmanager
+async def flood(server: Victim) -> AsyncIterator[None]:
+    """One caller that sends 240,000 heartbeats as fast as it can."""
+    stranger = await Stranger.at(server)
+    await stranger.open(None, STRANGE)
+    burst = b"".join(frame(m.Ping(n)) for n in range(4_000))
+    done = asyncio.create_task(_flood(stranger, burst, 60))
+    yield
+    await done
+    stranger.close()
+
+
+async def under(attack: Attack, server: Victim) -> dict[str, Any]:
+    """One row."""
+    client = server.client()
+    client.start()
+    assert await client.connected(20.0)
+    over = asyncio.Event()
+    async with attack(server):
+        calls = asyncio.create_task(times(client, lambda n: over.is_set() and n >= LEAST))
+    over.set()
+    took = await calls
+    await client.close()
+    return {
+        "calls": len(took),
+        "p50_ms": round(1e3 * quantile(took, 0.5), 2),
+        "p99_ms": round(1e3 * quantile(took, 0.99), 2),
+        "max_ms": round(1e3 * max(took), 1),
+        "grown_MiB": round(server.grown() / MIB, 1),
+        "faults": server.about()["faults"],
+    }
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", metavar="FILE", type=Path, help="write the figures as JSON")
+    options = parser.parse_args()
+    hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    rows: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        make_certificates(Path(folder), ["coordinator", "vision"])
+        cases: list[tuple[str, Attack, dict[str, Any]]] = [
+            ("calm", nothing, {}),
+            ("10,000 connections", connections, {}),
+            ("10,000, shared key", connections, {"key": KEY.hex()}),
+            ("10,000, TLS", connections, {"folder": folder}),
+            ("random bytes", noise, {}),
+            ("flood of heartbeats", flood, {}),
+        ]
+        for name, attack, settings in cases:
+            server = Victim(settings)
+            try:
+                rows[name] = asyncio.run(under(attack, server))
+            finally:
+                server.close()
+            row = rows[name]
+            print(
+                f"{name:22} calls {row['calls']:5}  p50 {row['p50_ms']:7.2f} ms  p99 {row['p99_ms']:8.2f}"
+                f"  max {row['max_ms']:8.1f}  grown {row['grown_MiB']:5.1f} MiB"
+            )
+    print(f"load {os.getloadavg()[0]:.1f}")
+    if options.json:
+        options.json.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
