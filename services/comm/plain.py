@@ -66,7 +66,7 @@ def _plain_dict(value: Mapping[Any, Any], where: str, depth: int) -> dict[str, A
         if kind in _SIMPLE:
             copy[key] = item
         elif kind is list and depth > 1 and _SIMPLE.issuperset(map(type, item)):
-            copy[key] = list(item)  # as below, without naming the place
+            copy[key] = item[:]  # as below, without naming the place
         else:
             copy[key] = _plain(item, f"{where}.{key}", depth - 1)
     return copy

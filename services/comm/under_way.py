@@ -11,6 +11,7 @@ from typing import Final
 from services.comm.messages import Call, Executed, Outcome
 
 NEVER: Final = float("inf")
+_SPARE: Final = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +65,11 @@ class UnderWay(dict[str, Pending]):
     def watch_accept(self, pending: Pending, due: float) -> None:
         """Wait for ACCEPT until `due`."""
         pending.accept_due = due
-        self._accepts.append((due, pending.call.id))
+        accepts = self._accepts
+        accepts.append((due, pending.call.id))
+        if len(accepts) > 2 * len(self) + _SPARE:
+            # Most of them have ended long before their time: a second of quick calls is a hundred thousand of them.
+            self._drop_past()
 
     def watch_result(self, pending: Pending, due: float) -> None:
         """Wait for RESULT until `due`, or until an earlier time set before."""
@@ -106,12 +111,15 @@ class UnderWay(dict[str, Pending]):
 
     def due(self) -> float:
         """When the next watch is over (s)."""
-        while self._accepts and self._is_past(self._accepts[0][1]):
-            self._accepts.popleft()
+        self._drop_past()
         while self._results and self._results[0][1] not in self:
             heapq.heappop(self._results)
         accept = self._accepts[0][0] if self._accepts else NEVER
         return min(accept, self._results[0][0]) if self._results else accept
+
+    def _drop_past(self) -> None:
+        while self._accepts and self._is_past(self._accepts[0][1]):
+            self._accepts.popleft()
 
     def _is_past(self, id_: str) -> bool:
         pending = self.get(id_)

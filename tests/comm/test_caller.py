@@ -196,6 +196,16 @@ def test_a_cancelled_call_that_never_ends_is_given_up() -> None:
     assert _ends(caller.notices()) == [("1", "no_answer", Executed.UNKNOWN)]
 
 
+def test_quick_calls_leave_nothing_behind() -> None:
+    caller = _caller()
+    caller.begin(0.0, "first", "get", {}, done=lambda outcome: None)
+    caller.take_outcomes(0.0, [m.Outcome("first", "success")])
+    for n in range(5_000):
+        caller.begin(0.0, str(n), "get", {}, done=lambda outcome: None)
+        caller.take_outcomes(0.0, [m.Outcome(str(n), "success")])
+    assert len(caller._pending) == 0 and len(caller._pending._accepts) < 500
+
+
 def test_very_many_results_at_once_are_acknowledged_in_messages_that_may_be_sent() -> None:
     caller = _caller()
     ids = [f"{n:0255}" for n in range(1_000)]
