@@ -11,6 +11,7 @@ microseconds are this machine's.
 from __future__ import annotations
 
 import argparse
+import gc
 import importlib.util
 import json
 import os
@@ -52,6 +53,8 @@ class Table:
             assert process.stdout is not None
             one.connect(int(process.stdout.readline()))
             one.latencies(200, 0)
+        gc.collect()
+        gc.freeze()  # what all of them have imported is no garbage of the one that is being measured
 
     def measure(self, rounds: int, calls: int) -> None:
         """Rounds of all; within a round they take turns every few calls, so that the machine is in one mood for all."""
