@@ -26,6 +26,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--against", metavar="CAMPAIGN", type=Path, help="compare with this campaign, throw by throw")
     parser.add_argument(
+        "--rho-of",
+        metavar="CAMPAIGN",
+        type=Path,
+        help="weigh costs as the actions of this campaign do (default: of the two)",
+    )
+    parser.add_argument(
         "--out", metavar="FILE", type=Path, help="the page (default: report.html beside what it is about)"
     )
     parser.add_argument("--json", metavar="FILE", help="write the comparison's numbers as JSON (- for standard output)")
@@ -75,7 +81,7 @@ def _campaign(folder: Path, options: argparse.Namespace) -> tuple[str, dict[str,
     report = CampaignReport(plan, task, rows, _plots(folder))
     more: list[str] = []
     if options.against is not None:
-        found = compared(folder, options.against)
+        found = compared(folder, options.against, options.rho_of)
         one, other = _names(folder, options.against)
         pictures = comparison_pictures(found, one, other)
         more = [comparison_section(found, one, other)]
@@ -102,14 +108,15 @@ def opened(folder: Path) -> tuple[Plan, Task, list[Row]]:
     return plan, load_task(plan.task), rows
 
 
-def compared(one: Path, other: Path) -> dict[str, Any]:
-    """The numbers of a comparison of two campaigns' folders."""
-    from coordinator.report.comparing import compare
+def compared(one: Path, other: Path, rho_of: Path | None = None) -> dict[str, Any]:
+    """The numbers of a comparison of two campaigns' folders; rho is that of a third one's actions, if given."""
+    from coordinator.report.comparing import Weighting, compare
 
     _, task, rows = opened(one)
     _, _, others = opened(other)
+    weighting = None if rho_of is None else Weighting.of(task, opened(rho_of)[2])
     try:
-        return {"one": one.name, "other": other.name, **compare(task, rows, others)}
+        return {"one": one.name, "other": other.name, **compare(task, rows, others, weighting)}
     except ValueError as fault:
         raise CommandError(2, str(fault)) from fault
 

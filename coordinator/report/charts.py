@@ -53,7 +53,7 @@ def limits(values: Sequence[float], *, zero: bool = False, room: float = 0.04) -
     low = min(0.0, low) if zero else low
     span = high - low
     if span <= 1e-9 * max(abs(low), abs(high), 1e-9):  # all the same: an axis about it
-        span = abs(high) or 1.0
+        span = abs(high) if abs(high) > 1e-9 else 1.0
         room = max(room, 0.04)
     return (low if zero and low == 0.0 else low - room * span), high + room * span
 

@@ -50,7 +50,12 @@ def combination_of(task: Task, row: Row, names: Sequence[str]) -> dict[str, str]
     return out
 
 
-def by_combination(task: Task, rows: Iterable[Row], planned: Sequence[dict[str, str]] | None = None) -> list[Judged]:
+def by_combination(
+    task: Task,
+    rows: Iterable[Row],
+    planned: Sequence[dict[str, str]] | None = None,
+    weighting: Weighting | None = None,
+) -> list[Judged]:
     """Every combination in these rows, the lowest J first.
 
     `planned`: the combination meant for each row; a throw that ended before all of its runs still counts for it. Without it, only
@@ -58,7 +63,7 @@ def by_combination(task: Task, rows: Iterable[Row], planned: Sequence[dict[str, 
     """
     kept = [row for row in rows if row.throw is not None]
     names = [p.name for p in task.primitive_tasks.values() if len(p.alternatives) > 1]
-    weighting = Weighting.of(task, kept)
+    weighting = weighting or Weighting.of(task, kept)
     groups: dict[Combination, list[Row]] = {}
     for i, row in enumerate(kept):
         chosen = planned[i] if planned is not None else combination_of(task, row, names)

@@ -42,9 +42,12 @@ def paired(one: Iterable[Row], other: Iterable[Row]) -> Pairs:
     return Pairs(tuple(first[k] for k in common), tuple(second[k] for k in common), left)
 
 
-def compare(task: Task, one: Iterable[Row], other: Iterable[Row], seed: int = 1) -> dict[str, Any]:
+def compare(
+    task: Task, one: Iterable[Row], other: Iterable[Row], weighting: Weighting | None = None, seed: int = 1
+) -> dict[str, Any]:
     """What the first campaign does better (positive differences in shares, negative in J and time) than the second.
 
+    `weighting` gives the rho of J, so that several comparisons have one; without it, rho is that of the actions in these two.
     Raises ValueError when they have no throw in common.
     """
     pairs = paired(one, other)
@@ -61,12 +64,14 @@ def compare(task: Task, one: Iterable[Row], other: Iterable[Row], seed: int = 1)
     found: dict[str, Any] = {name: share_difference(pairs, met) for name, met in shares.items()}
     own = own_flags(pairs)
     found |= {name: share_difference(pairs, _flag(name)) for name in own}
+    weighting = weighting or Weighting.of(task, (*pairs.one, *pairs.other))
     return {
         "pairs": len(pairs.one),
         "left_out": pairs.left_out,
+        "rho": {**weighting.rho, "task": weighting.task},
         "shares": found,
         "time": _time(pairs),
-        "J": objective_difference(task, pairs, random),
+        "J": objective_difference(task, pairs, weighting, random),
     }
 
 
@@ -145,12 +150,11 @@ def objectives(task: Task, rows: Sequence[Row], weighting: Weighting) -> dict[st
     return found | {"task": float(_objective(_task_sums(rows), whole, weighting.task)[0])}
 
 
-def objective_difference(task: Task, pairs: Pairs, random: np.random.Generator) -> dict[str, Any]:
+def objective_difference(task: Task, pairs: Pairs, weighting: Weighting, random: np.random.Generator) -> dict[str, Any]:
     """J of each primitive task with alternatives, their mean, and J of the task (1 - R_goal + rho * time), in both campaigns."""
     n = len(pairs.one)
     weights = random.multinomial(n, np.full(n, 1 / n), size=REPLICATES)
     whole = np.ones((1, n))
-    weighting = Weighting.of(task, (*pairs.one, *pairs.other))
     out: dict[str, Any] = {}
     means: list[tuple[float, float, Values, Values]] = []
     for name, rho in weighting.rho.items():

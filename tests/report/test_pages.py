@@ -14,7 +14,7 @@ from coordinator.campaign.rows import Row
 from coordinator.campaign.throws import RunEntry, Throw
 from coordinator.cli import main
 from coordinator.report.campaign_page import CampaignReport, story, timeline_of
-from coordinator.report.comparing import compare, cost_weight, paired
+from coordinator.report.comparing import Weighting, compare, cost_weight, paired
 from coordinator.report.plots import declared, finished
 from coordinator.report.run_page import own_pictures
 from coordinator.report.trials import objective_curves
@@ -55,6 +55,9 @@ def test_comparison_by_hand() -> None:
     assert (look["one"], look["other"]) == (pytest.approx(1 - 0.8 + 0.5), pytest.approx(1 - 0.6 + 1.0))
     assert look["interval"][0] <= look["difference"] <= look["interval"][1]
     assert found["J"]["mean"]["one"] == look["one"]
+    weighted = compare(TOY, one, other, Weighting({"look": 0.1}, 0.2))["J"]
+    assert weighted["look"]["difference"] == pytest.approx((0.2 + 0.1) - (0.4 + 0.2))
+    assert weighted["task"]["difference"] == pytest.approx((0.2 + 0.2) - (0.4 + 0.4))
 
 
 def test_pairs_have_equal_seeds() -> None:
@@ -234,6 +237,6 @@ def test_combinations_by_hand() -> None:
     assert by_combination(TOY, rows) == []  # grip was never run
     best, other = by_combination(TOY, rows, planned)
     assert dict(best.combination)["look"] == "look_long"  # 1 - .5 + 1/2 = 1.0 and 1 - 1 + 2/2 = 1.0: the first by name
-    assert (best.objective, other.objective) == (pytest.approx(1.0), pytest.approx(1.0))
+    assert [best.objective, other.objective] == pytest.approx([1.0, 1.0])
     assert (best.goal, other.goal, best.throws) == (0.5, 1.0, 20)
     assert other.task_objective == pytest.approx(0.0 + 2.0 / 1.5)

@@ -1,0 +1,356 @@
+"""Learning, speed of campaigns and forecasts on a whole cell: the floors of docs/campaigns.md and docs/forecast.md in full.
+
+    python -m tests.proof.learning                       # all of it (hours); resumes where it stopped
+    python -m tests.proof.learning learn --share 0.1     # a tenth of every size, judged by the same rules
+    python -m tests.proof.learning forecast --regimes A,B,C,B+dim --runs 2000
+
+Every campaign has a folder of its own, so an interrupted proof goes on. Results go to `--folder`, tables to `--page`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from coordinator.campaign.policies import RoundRobin, offered
+from coordinator.campaign.rows import Row
+from coordinator.campaign.table import TABLE, read_table
+from coordinator.cli.loading import load_directory, load_task
+from coordinator.cli.report import compared
+from coordinator.report.combinations import Judged, by_combination
+from coordinator.report.comparing import Weighting
+from coordinator.task import Task
+from tests.proof.proof import ROOT
+
+CLOSE, FAST = 0.02, 15.0
+"""Largest J beyond the best fixed combination's, and times real time a core."""
+FINALISTS = 6
+GROWTH_MB = 30.0
+"""Memory that a worker may gain between its first blocks and its last ones."""
+
+Result = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is run; the full proof has share 1."""
+
+    share: float
+    workers: int
+    folder: Path
+    task: str = "catch_ball"
+    services: Path | None = None
+
+    @property
+    def given(self) -> tuple[str, ...]:
+        """What every campaign is given."""
+        return (self.task, *(("--services", str(self.services)) if self.services else ()), "--quiet")
+
+    def of(self, throws: int, least: int = 20) -> int:
+        """A number of throws, scaled."""
+        return max(least, round(throws * self.share))
+
+
+def petrobot(*arguments: str, codes: Sequence[int] = (0,)) -> None:
+    """Run a command. Raises RuntimeError with its words when it fails."""
+    done = subprocess.run(
+        [sys.executable, "-m", "coordinator", *arguments], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    if done.returncode not in codes:
+        raise RuntimeError(
+            f"petrobot {' '.join(arguments)}: exit {done.returncode}\n{done.stdout[-1000:]}{done.stderr[-2000:]}"
+        )
+
+
+def campaign(sizes: Sizes, name: str, throws: int, seed: int, regime: str, *more: str) -> Result:
+    """A campaign in its folder, or what is kept of it."""
+    folder = sizes.folder / name
+    path = folder / "result.json"
+    if path.exists() and json.loads(path.read_text(encoding="utf-8"))["begun"]:
+        kept: Result = json.loads(path.read_text(encoding="utf-8"))
+        if kept["runs"] == throws and kept["seed"] == seed:
+            return kept
+    print(f"  {name}: {throws} throws of {regime}, seed {seed}", flush=True)
+    given = ("--runs", str(throws), "--seed", str(seed), "--regime", regime, "--out", str(folder))
+    petrobot("campaign", *sizes.given, *given, "--workers", str(sizes.workers), *more)
+    result: Result = json.loads(path.read_text(encoding="utf-8"))
+    return result
+
+
+def rows_of(sizes: Sizes, name: str) -> list[Row]:
+    """The table of a campaign."""
+    return list(read_table(sizes.folder / name / TABLE))
+
+
+# --- learning ------------------------------------------------------------------------------------------------------------
+
+
+def learn(sizes: Sizes, options: argparse.Namespace) -> Result:
+    """Learn from scratch, freeze, and judge on fresh throws beside the best fixed combination and the default."""
+    task, regime = load_task(sizes.task), options.disturbed
+    learned: dict[int, dict[str, str]] = {}
+    for seed in range(1, options.seeds + 1):
+        found = campaign(sizes, f"learn_{seed}", sizes.of(1000, 100), seed, regime, "--selector", options.selector)
+        learned[seed] = {name: known["best"] for name, known in found["policy"][regime].items()}
+    best = best_fixed(sizes, task, regime)
+    default = {p.name: p.alternatives[0] for p in task.primitive_tasks.values() if len(p.alternatives) > 1}
+    judge(sizes, "default", default, regime)
+    judge(sizes, "best", best, regime)
+    lines = [_judged(sizes, seed, actions, best, regime) for seed, actions in learned.items()]
+    holds = all(
+        line["J beyond the best, upper 95 %"] <= CLOSE and line["J beyond the default, upper 95 %"] < 0
+        for line in lines
+    )
+    return {"regime": regime, "best": best, "default": default, "rows": lines, "holds": holds}
+
+
+def best_fixed(sizes: Sizes, task: Task, regime: str) -> dict[str, str]:
+    """The combination with the lowest J: all of them on some throws, the best few on more, chosen on none of the judge's.
+
+    The costs of the first table, in which every action was run, give the one rho of all J in this proof.
+    """
+    count = 1
+    for p in task.primitive_tasks.values():
+        count *= len(p.alternatives)
+    screened = sizes.of(100, 5) * count
+    campaign(sizes, "screen", screened, 50, regime, "--selector", "round_robin")
+    rotation = RoundRobin(offered(task, load_directory(sizes.services)), {})
+    rows = rows_of(sizes, "screen")
+    planned = [rotation.combination(row.n - 1) for row in rows if row.throw is not None]
+    weighting = Weighting.of(task, rows)
+    finalists = by_combination(task, rows, planned, weighting)[:FINALISTS]
+    every: list[Row] = []
+    plans: list[dict[str, str]] = []
+    for number, one in enumerate(finalists):
+        chosen = dict(one.combination)
+        judge(sizes, f"final_{number}", chosen, regime, throws=sizes.of(500), seed=51)
+        rows = [row for row in rows_of(sizes, f"final_{number}") if row.throw is not None]
+        every += rows
+        plans += [chosen] * len(rows)
+    ranked: list[Judged] = by_combination(task, every, plans, weighting)
+    return dict(ranked[0].combination)
+
+
+def judge(
+    sizes: Sizes, name: str, chosen: Mapping[str, str], regime: str, throws: int | None = None, seed: int = 60
+) -> Result:
+    """A fixed combination on fresh throws."""
+    text = ",".join(f"{task}={action}" for task, action in chosen.items())
+    return campaign(sizes, name, throws or sizes.of(5000), seed, regime, "--choose", text)
+
+
+def _judged(sizes: Sizes, seed: int, actions: Mapping[str, str], best: Mapping[str, str], regime: str) -> Result:
+    name = "judged_" + "_".join(actions.values())
+    judge(sizes, name, actions, regime)
+    to_best = compared(sizes.folder / name, sizes.folder / "best", sizes.folder / "screen")
+    to_default = compared(sizes.folder / name, sizes.folder / "default", sizes.folder / "screen")
+    return {
+        "learning seed": seed,
+        **actions,
+        "is the best": dict(actions) == dict(best),
+        "J": to_best["J"]["mean"]["one"],
+        "J of the best": to_best["J"]["mean"]["other"],
+        "J beyond the best, upper 95 %": to_best["J"]["mean"]["upper_95"],
+        "J of the default": to_default["J"]["mean"]["other"],
+        "J beyond the default, upper 95 %": to_default["J"]["mean"]["upper_95"],
+        "J of the task beyond the best": to_best["J"]["task"]["difference"],
+        "R_goal": to_best["shares"]["R_goal"]["one"],
+        "R_goal of the best": to_best["shares"]["R_goal"]["other"],
+        "R_goal of the default": to_default["shares"]["R_goal"]["other"],
+        **{name: share["one"] for name, share in to_best["shares"].items() if "." in name},
+        "p (McNemar) to the default": to_default["shares"]["R_goal"]["p"],
+    }
+
+
+# --- speed ---------------------------------------------------------------------------------------------------------------
+
+
+def speed(sizes: Sizes, options: argparse.Namespace) -> Result:
+    """Times real time a core, memory of the workers, and a campaign that is killed again and again."""
+    found = campaign(sizes, "speed", sizes.of(1000), 80, options.regimes.split(",")[0])
+    growth = memory_growth(sizes.folder / "speed" / "times.csv")
+    same, kills = interrupted(sizes, sizes.of(120, 24), options.regimes.split(",")[0])
+    holds = found["times_real_time_per_core"] >= FAST and growth <= GROWTH_MB and same
+    return {
+        "throws": found["begun"],
+        "workers": found["workers"],
+        "cycle (s)": round(found["sim_s"] / found["begun"], 3),
+        "minutes": round(found["wall_s"] / 60, 2),
+        "times real time a core": found["times_real_time_per_core"],
+        "times real time a CPU second": found["times_real_time_per_cpu_s"],
+        "memory gained by a worker (MiB)": growth,
+        "killed": kills,
+        "same table when killed": same,
+        "holds": holds,
+    }
+
+
+def memory_growth(times: Path) -> float:
+    """The largest gain of a worker from the median of its third to eighth block to that of its last six (MiB)."""
+    by_worker: dict[str, list[float]] = {}
+    with times.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            by_worker.setdefault(row["worker"], []).append(float(row["rss_mb"]))
+    gains = [median(rss[-6:]) - median(rss[2:8]) for rss in by_worker.values() if len(rss) >= 16]
+    return round(max(gains, default=0.0), 1)
+
+
+def interrupted(sizes: Sizes, throws: int, regime: str) -> tuple[bool, int]:
+    """Whether a campaign that is killed several times comes to the table of one that is not; and how often it was killed."""
+    chosen = ("--seed", "81", "--regime", regime, "--selector", "nikolic_fu_fast")
+    given = (*sizes.given, "--runs", str(throws), *chosen)
+    whole, part = sizes.folder / "whole", sizes.folder / "killed"
+    for folder in (whole, part):
+        shutil.rmtree(folder, ignore_errors=True)
+    petrobot("campaign", *given, "--workers", str(sizes.workers), "--out", str(whole))
+    command = [sys.executable, "-m", "coordinator", "campaign", *given, "--workers", "1", "--out", str(part)]
+    chance, kills = random.Random(1), 0
+    table = part / TABLE
+    while kills < 4:
+        going = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        wanted = (table.stat().st_size if table.exists() else 0) + chance.randint(1, 20_000)
+        while going.poll() is None and not (table.exists() and table.stat().st_size >= wanted):
+            time.sleep(0.02)
+        if going.poll() is not None:
+            break
+        going.send_signal(signal.SIGKILL)
+        going.wait()
+        kills += 1
+    petrobot("campaign", *given, "--workers", str(sizes.workers), "--out", str(part))
+    return (whole / TABLE).read_bytes() == table.read_bytes(), kills
+
+
+# --- forecasts -----------------------------------------------------------------------------------------------------------
+
+
+def forecast(sizes: Sizes, options: argparse.Namespace) -> Result:
+    """Train, register, run, compare; regimes with the same seeds."""
+    regimes = options.regimes
+    count = len(regimes.split(","))
+    campaign(sizes, "train", sizes.of(options.training) * count, 70, regimes)
+    registered = sizes.folder / "forecast.json"
+    if not registered.exists():
+        runs = str(sizes.of(options.runs))
+        petrobot(
+            "forecast", sizes.task, "--estimates", str(sizes.folder / "train"), "--runs", runs, "--out", str(registered)
+        )
+    campaign(sizes, "new", sizes.of(options.runs) * count, 71, regimes)
+    page, numbers = sizes.folder / "forecast.md", sizes.folder / "agreement.json"
+    told = ("--compare", str(registered), str(sizes.folder / "new"), "--markdown", str(page), "--json", str(numbers))
+    petrobot("forecast", *told, codes=(0, 1))
+    found: Result = json.loads(numbers.read_text(encoding="utf-8"))
+    holds = found["agrees"] and found["equivalent"] and found["registered_before"]
+    return {**found, "page": page.read_text(encoding="utf-8"), "holds": holds}
+
+
+# --- page ----------------------------------------------------------------------------------------------------------------
+
+
+def page(results: Mapping[str, Result], sizes: Sizes) -> str:
+    """The tables, with the command that remakes them."""
+    share = "" if sizes.share == 1 else f" --share {sizes.share:g}"
+    lines = [f"# Learning and forecasting, {sizes.task}: figures", ""]
+    lines += [f"Written by `python -m tests.proof.learning{share} --workers {sizes.workers}`; what is meant stands in"]
+    lines += ["[campaigns.md](campaigns.md) and [forecast.md](forecast.md).", ""]
+    if "learn" in results:
+        found = results["learn"]
+        lines += [f"## Learned, frozen, judged on fresh throws of {found['regime']}", ""]
+        lines += [
+            f"Best fixed combination, chosen on other throws: {', '.join(found['best'].values())}. {_verdict(found)}",
+            "",
+        ]
+        lines += [*_turned(found["rows"]), ""]
+    if "speed" in results:
+        found = {k: v for k, v in results["speed"].items() if k != "holds"}
+        lines += ["## Speed, memory, interruption", "", _verdict(results["speed"]), "", *_turned([found]), ""]
+    if "forecast" in results:
+        found = results["forecast"]
+        rejected = ", ".join(found["product_rejected"]) or "no regime"
+        lines += ["## Forecast and measurement", "", _verdict(found), "", found["page"]]
+        lines += [f"The product rule is rejected in {rejected}.", ""]
+    return "\n".join(lines)
+
+
+def _verdict(found: Mapping[str, Any]) -> str:
+    return "The floor holds." if found["holds"] else "**The floor does not hold.**"
+
+
+def _turned(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A table with a column for each record."""
+    names = list(rows[0])
+    head = "| " + " | ".join(["", *(str(i + 1) if len(rows) > 1 else "measured" for i in range(len(rows)))]) + " |"
+    return [
+        head,
+        "|" + "---|" * (len(rows) + 1),
+        *("| " + " | ".join([n, *(_text(r[n]) for r in rows)]) + " |" for n in names),
+    ]
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+STEPS: Mapping[str, Callable[[Sizes, argparse.Namespace], Result]] = {
+    "learn": learn,
+    "speed": speed,
+    "forecast": forecast,
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the steps asked for; 1 if a floor does not hold."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("steps", nargs="*", metavar="STEP", help=f"of {', '.join(STEPS)} (default: all)")
+    parser.add_argument("--share", type=float, default=1.0, metavar="X", help="of every number of throws (%(default)s)")
+    parser.add_argument("--workers", type=int, default=2, metavar="K")
+    parser.add_argument("--folder", type=Path, default=ROOT / "reports" / "proof" / "learning", metavar="FOLDER")
+    parser.add_argument("--task", default="catch_ball", metavar="TASK", help="(%(default)s)")
+    parser.add_argument("--services", type=Path, metavar="FILE", help="its location file (the shipped one)")
+    parser.add_argument("--page", type=Path, metavar="FILE", help="docs/figures-learning.md in the full proof")
+    parser.add_argument("--disturbed", default="B+dim", metavar="REGIME", help="in which is learned (%(default)s)")
+    parser.add_argument("--selector", default="nikolic_fu_fast", metavar="NAME")
+    parser.add_argument("--seeds", type=int, default=5, metavar="N", help="learning seeds (%(default)s)")
+    parser.add_argument("--regimes", default="A,B,C", metavar="A,B", help="that are forecast (%(default)s)")
+    parser.add_argument("--training", type=int, default=2000, metavar="N", help="throws a regime (%(default)s)")
+    parser.add_argument("--runs", type=int, default=1000, metavar="N", help="new throws a regime (%(default)s)")
+    options = parser.parse_args(argv)
+    unknown = [step for step in options.steps if step not in STEPS]
+    if unknown:
+        parser.error(f"no step {unknown[0]}: {', '.join(STEPS)}")
+    sizes = Sizes(options.share, options.workers, options.folder, options.task, options.services)
+    sizes.folder.mkdir(parents=True, exist_ok=True)
+    results: dict[str, Result] = {}
+    for name in options.steps or STEPS:
+        print(f"{name} ...", flush=True)
+        results[name] = STEPS[name](sizes, options)
+        (sizes.folder / f"{name}.json").write_text(json.dumps(results[name], indent=2), encoding="utf-8")
+        print(f"{name}: {'holds' if results[name]['holds'] else 'DOES NOT HOLD'}", flush=True)
+    written = options.page or (
+        ROOT / "docs" / "figures-learning.md" if sizes.share == 1 else sizes.folder / "figures.md"
+    )
+    kept = {
+        name: json.loads(path.read_text(encoding="utf-8"))
+        for name in STEPS
+        if (path := sizes.folder / f"{name}.json").exists()
+    }
+    written.write_text(page(kept, sizes), encoding="utf-8")
+    print(f"tables: {written}")
+    return 0 if all(found["holds"] for found in results.values()) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
