@@ -30,6 +30,8 @@ STUCK: Final = 0.5
 """s of standing without a line after which it counts as lost."""
 NEAR_GATE: Final = 0.40
 """m off where a track can resume within which a reflector is taken to mark it."""
+STALENESS: Final = 0.1
+"""m/s: what a reflector's place is worth less for each second since its last echo."""
 REFLECTOR_PATIENCE: Final = 1.2
 """s that a reflector is waited for at the line's end."""
 LOOKS: Final = ((0.8, (0.0, 1.4, -1.4, 0.7, -0.7)), (0.2, (0.0, 0.8, -0.8)))
@@ -322,15 +324,13 @@ def _geometry(line_end: Sequence[float]) -> tuple[Pose, tuple[Pose, Pose, Pose]]
     return end, paths.resume_poses(end, track.square, track.radius)
 
 
-def _marked(
-    reflectors: Sequence[Sequence[float]], gates: Sequence[Pose]
-) -> tuple[float, float] | None:
-    """The reflector above one of the places where the track can resume; the most often heard if there are several."""
+def _marked(reflectors: Sequence[Sequence[float]], gates: Sequence[Pose]) -> tuple[float, float] | None:
+    """The reflector above one of the places where the track can resume: the one nearest to such a place and heard of late."""
     best: tuple[float, float, float] | None = None
-    for x, y, echoes in reflectors:
-        off = min(math.hypot(x - gate.x, y - gate.y) for gate in gates)
-        if off < NEAR_GATE and (best is None or echoes > best[2]):
-            best = (x, y, echoes)
+    for x, y, _, age in reflectors:
+        off = min(math.hypot(x - gate.x, y - gate.y) for gate in gates) + STALENESS * age
+        if off < NEAR_GATE and (best is None or off < best[2]):
+            best = (x, y, off)
     return None if best is None else (best[0], best[1])
 
 

@@ -16,6 +16,11 @@ TIGHTEST: Final = 4.0
 """1/m: the most curved way that is driven."""
 
 
+def capped(value: float, limit: float) -> float:
+    """A value brought within +-limit."""
+    return max(-limit, min(limit, value))
+
+
 @dataclass(frozen=True, slots=True)
 class PurePursuit:
     """Drive the circle, tangent to the heading, that leads to the point of the line `distance` m away (Coulter 1992).
@@ -33,7 +38,7 @@ class PurePursuit:
             if fit is None:
                 return None
             x = math.sqrt(max(0.04, self.distance**2 - fit.y**2))
-        return 2.0 * fit.y / (x * x + fit.y * fit.y)
+        return capped(2.0 * fit.y / (x * x + fit.y * fit.y), TIGHTEST)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,15 +54,20 @@ class FeedForward:
     damping: float = 1.1
     lead: float = 0.09
     """s from a set point until the wheels have answered."""
+    bent: float = 1.2
+    """1/m that a line is believed to be curved at most: the track's arcs have 1 m radius, what seems tighter is a kink."""
+    steepest: float = 0.5
+    """Sine of the angle at which a line far aside is approached at most: the camera must not lose it."""
 
     def curvature(self, look: Look, speed: float) -> float | None:
         """1/m, None where the line is not known at the axle and just ahead of it."""
         here, soon = look(0.0), look(self.lead * speed)
         if here is None or soon is None:
             return None
-        across = here.y * math.cos(here.heading)
-        bent = min(TIGHTEST, max(-TIGHTEST, soon.curvature))
-        return bent + self.gain * across + 2.0 * self.damping * math.sqrt(self.gain) * math.sin(here.heading)
+        damping = 2.0 * self.damping * math.sqrt(self.gain)
+        towards = capped(self.gain / damping * here.y * math.cos(here.heading), self.steepest)
+        bent = capped(soon.curvature, self.bent)
+        return capped(bent + damping * (towards + math.sin(here.heading)), TIGHTEST)
 
 
 LAWS: Final[Mapping[str, PurePursuit | FeedForward]] = {"feed_forward": FeedForward(), "pursuit": PurePursuit()}
@@ -86,8 +96,3 @@ class SpeedProfile:
         """The next set speed (m/s) on the way from the present one to the wanted one."""
         up, down = self.raising * dt, 1.6 * self.braking * dt
         return min(max(wanted, present - down), present + up)
-
-
-def capped(value: float, limit: float) -> float:
-    """A value brought within +-limit."""
-    return max(-limit, min(limit, value))

@@ -24,6 +24,8 @@ BELIEVED: Final = 4
 """Echoes that make a reflector."""
 LONELY: Final = 1.5
 """s after which a place with fewer is forgotten."""
+REMEMBERED: Final = 20.0
+"""s after which a believed one is forgotten: odometry drifts, and what was heard long ago is not where it seems."""
 MOST: Final = 24
 """Places that are kept."""
 
@@ -64,11 +66,12 @@ class ReflectorMap:
             level = math.sqrt(slant * slant - self._above * self._above)
             x, y = pose.floor(self._forward + level * math.cos(bearing), level * math.sin(bearing))
             self._note(now, x, y)
-        self._places = [p for p in self._places if p.count >= BELIEVED or now - p.last < LONELY][-MOST:]
+        patience = {True: REMEMBERED, False: LONELY}
+        self._places = [p for p in self._places if now - p.last < patience[p.count >= BELIEVED]][-MOST:]
 
-    def believed(self) -> list[tuple[float, float, int]]:
-        """Reflectors: x, y (m, odometry frame) and the number of echoes."""
-        return [(p.x, p.y, p.count) for p in self._places if p.count >= BELIEVED]
+    def believed(self, now: float) -> list[tuple[float, float, int, float]]:
+        """Reflectors: x, y (m, odometry frame), the number of echoes, and how long ago the last one came (s)."""
+        return [(p.x, p.y, p.count, now - p.last) for p in self._places if p.count >= BELIEVED]
 
     def _note(self, now: float, x: float, y: float) -> None:
         near = min(self._places, key=lambda p: math.hypot(p.x - x, p.y - y), default=None)

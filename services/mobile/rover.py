@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from services.device import Ports, Setpoint
-from services.mobile.following import LAWS, SpeedProfile, capped
+from services.mobile.following import LAWS, PurePursuit, SpeedProfile, capped
 from services.mobile.model import Rover as Numbers
 from services.mobile.model import nominal_rover, read_rover
 from services.mobile.odometry import Odometry, Pose, turned
@@ -28,6 +28,8 @@ LEASE: Final = 0.4
 STANDING: Final = 0.004
 """m/s below which the rover counts as standing."""
 STREAM: Final = "track_ahead"
+JOINING: Final = PurePursuit(0.6)
+"""Towards a line that is known ahead, but not yet at the axle."""
 AT_END: Final = 0.04
 """m before the end of all that is known at which there is no line any more."""
 TURN_GAIN: Final = 3.0
@@ -72,6 +74,7 @@ class Rover:
         self._set = (0.0, 0.0)
         self._taken = 0
         self._cycles = 0
+        self._now = ports.now
         self._fits: dict[float, Fit | None] = {}
         self._commands: dict[str, Callable[[float, Mapping[str, Any]], None]] = {
             "follow": self._follow,
@@ -96,6 +99,7 @@ class Rover:
     def step(self, now: float) -> None:
         """One cycle."""
         self._cycles += 1
+        self._now = now
         self._fits.clear()
         self._listen(now)
         self._measure(now)
@@ -131,7 +135,7 @@ class Rover:
             "sights": self._map.sights,
             "refused": self._map.refused,
             "stream_age": self._setpoint.age,
-            "reflectors": self._reflectors.believed(),
+            "reflectors": self._reflectors.believed(self._now),
             "sensor": self._master.sensor_alive,
             "limited": self._master.limited,
             "faults": [(t.cause, t.wheel, t.code, t.text) for t in self._master.troubles],
@@ -269,7 +273,7 @@ class Rover:
             return self._brake()
         curvature = LAWS[self._law].curvature(self._fit, self._speed)
         if curvature is None:
-            curvature = LAWS["pursuit"].curvature(self._fit, self._speed)
+            curvature = JOINING.curvature(self._fit, self._speed)
         ahead = self._map.ahead(self._odometry.pose)
         if curvature is None or ahead <= AT_END:
             self._reason = "no_line"

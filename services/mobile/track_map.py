@@ -36,6 +36,8 @@ OTHER = 0.15
 """m off what is known from which a sight is of something else."""
 GATE_ASIDE, GATE_TURN = 0.3, 0.6
 """m and rad that a line may be off a gate."""
+STEP_ASIDE = 0.06
+"""m beside the plan from which a line seen is joined anew."""
 ENDS = 12
 """Sights of an end that are averaged."""
 
@@ -165,13 +167,23 @@ class TrackMap:
         return any(passes(line, gate, GATE_ASIDE, GATE_TURN) for gate in self._gates)
 
     def _see_instead_of_plan(self, pose: Pose, points: Sequence[tuple[float, float]]) -> None:
-        """What was planned for where the line is now seen is planned no more."""
-        if len(self._planned):
-            self._local = None
-            cos, sin = math.cos(pose.heading), math.sin(pose.heading)
-            x = (self._planned[:, 0] - pose.x) * cos + (self._planned[:, 1] - pose.y) * sin
-            y = (self._planned[:, 1] - pose.y) * cos - (self._planned[:, 0] - pose.x) * sin
-            self._planned = self._planned[~((x > points[0][0] - 0.06) & (np.abs(y - points[0][1]) < 1.0))]
+        """What was planned for where the line is now seen is planned no more.
+
+        A line that lies well beside the plan replaces all that was known: a step in the map would look like a bend.
+        """
+        if not len(self._planned):
+            return
+        x, y = points[0]
+        planned = self.fit(pose, x)
+        self._local = None
+        if planned is not None and abs(planned.y - y) > STEP_ASIDE and not self.sights:
+            self.drop_seen()
+            self.drop_plan()
+            return
+        cos, sin = math.cos(pose.heading), math.sin(pose.heading)
+        ahead = (self._planned[:, 0] - pose.x) * cos + (self._planned[:, 1] - pose.y) * sin
+        aside = (self._planned[:, 1] - pose.y) * cos - (self._planned[:, 0] - pose.x) * sin
+        self._planned = self._planned[~((ahead > x - 0.06) & (np.abs(aside - y) < 1.0))]
 
     def _contradicts(self, pose: Pose, points: Sequence[tuple[float, float]]) -> bool:
         off = []
