@@ -18,7 +18,7 @@ from services.comm import messages as m
 from services.comm.caller import Accepted, Caller, Ended, Late, Notice, PeerBack, PeerLost
 from services.comm.client import Client
 from services.comm.messages import Executed
-from services.comm.stream import STALE_AFTER, Incoming, StreamReceiver
+from services.comm.stream import Incoming, StreamReceiver
 
 from .fault_parts import HOST, STREAM, Cable, Fault, first_line, inflict, part
 
@@ -124,7 +124,7 @@ def poll_until(receiver: StreamReceiver, watch: Watch, holds: Callable[[], bool]
         select.select([], [], [], period / 10)
         watch.now = time.monotonic()
         receiver.poll()
-        assert not watch.valid or watch.now - watch.arrived[-1] <= STALE_AFTER * period, "too old, and it still counts"
+        assert not watch.valid or watch.now - watch.arrived[-1] <= 3 * period, "too old, and it still counts"
         assert watch.now < end, "it did not come to pass"
 
 
