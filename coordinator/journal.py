@@ -93,6 +93,11 @@ class JournalWriter:
         """Whether records wait for the next sync."""
         return bool(self._buffer) or self._unsynced
 
+    @property
+    def unsaved(self) -> bool:
+        """Whether records would be lost with this process."""
+        return bool(self._buffer)
+
     def flush(self) -> None:
         """Hand what was appended to the operating system: it survives the death of this process, not of the machine."""
         if not self._buffer:

@@ -85,9 +85,14 @@ def make_callers(directory: Directory, boot: str, epoch: int, name: str = NAME) 
 # --- lock step ---------------------------------------------------------------------------------------------------------
 
 
-def lockstep_mission(directory: Directory, setting: Setting) -> Mission:
-    """A mission run whose ids depend on task and seed alone, so that the same seed gives the same run."""
-    return make_mission(directory, setting, f"{setting.task.name}/{setting.seed}", "lock step")
+def lockstep_id(setting: Setting) -> str:
+    """The id of a mission run in lock step: it depends on task and seed alone, so that the same seed gives the same run."""
+    return f"{setting.task.name}/{setting.seed}"
+
+
+def lockstep_mission(directory: Directory, setting: Setting, store: Store | None = None) -> Mission:
+    """A mission run in lock step."""
+    return make_mission(directory, setting, lockstep_id(setting), "lock step", store)
 
 
 def lockstep_party(directory: Directory, node: NodeEntry, substitutes: Substitutes | None = None) -> Party:
@@ -103,9 +108,10 @@ def lockstep_cell(
     setting: Setting,
     substitutes: Substitutes | None = None,
     watch: Callable[[Mission, float], None] | None = None,
+    store: Store | None = None,
 ) -> tuple[Cell, CoordinatorParty]:
     """The whole cell in this process."""
-    mission = lockstep_mission(directory, setting)
+    mission = lockstep_mission(directory, setting, store)
     watching = None if watch is None else lambda now: watch(mission, now)
     coordinator = CoordinatorParty(directory, mission, watching)
     parties = [lockstep_party(directory, node, substitutes) for node in directory.nodes.values()]
@@ -113,15 +119,20 @@ def lockstep_cell(
 
 
 def lockstep_member(
-    directory: Directory, setting: Setting, watch: Callable[[Mission, float], None] | None = None
+    directory: Directory,
+    mission: Mission,
+    watch: Callable[[Mission, float], None] | None = None,
+    begin: Callable[[float], None] | None = None,
 ) -> tuple[Member, CoordinatorParty]:
-    """The coordinator's process of a cell in which each node has a process of its own."""
-    mission = lockstep_mission(directory, setting)
+    """The coordinator's process of a cell in which each node has a process of its own.
+
+    With `begin` it joins a cell that goes on, in place of a coordinator that died, and begins by that.
+    """
     watching = None if watch is None else lambda now: watch(mission, now)
-    coordinator = CoordinatorParty(directory, mission, watching)
-    delays = Delays(directory.delays())
-    key = credentials_of(directory).key
-    member = Member(NAME, [coordinator], directory.members(), delays=delays, directory=directory.hash, key=key)
+    coordinator = CoordinatorParty(directory, mission, watching, begin)
+    delays, key = Delays(directory.delays()), credentials_of(directory).key
+    addresses, rejoins = directory.members(), begin is not None
+    member = Member(NAME, [coordinator], addresses, delays=delays, directory=directory.hash, key=key, rejoins=rejoins)
     return member, coordinator
 
 
@@ -162,7 +173,7 @@ def resumed_mission(
     origin = origin_of(header, now, steps[-1].time if steps else 0.0)
     name = NAME if header["mode"] == "lockstep" else header["mission"]
     callers = make_callers(directory, secrets.token_hex(8), epoch, name)
-    store, chosen = JournalStore(writer, origin), selector or FirstAlternative()
+    store, chosen = JournalStore(writer, origin, durable=header.get("durable", False)), selector or FirstAlternative()
     executor = Executor(task, engine, directory, callers, header["mission"], header["seed"], chosen, store)
     mission = Mission(executor, header["parameters"], header["runs"])
     executor.observers.extend(observers)
@@ -171,10 +182,16 @@ def resumed_mission(
     return mission, lambda now: mission.resume(now, stages(journal))
 
 
-def local_programs(directory: Directory, *, lockstep: bool = False, mock: Path | None = None) -> list[Program]:
-    """The command lines of the nodes whose address is this host's, the laboratory first."""
+def local_programs(
+    directory: Directory, *, lockstep: bool = False, mock: Path | None = None, awaited: float = 0.0
+) -> list[Program]:
+    """The command lines of the nodes whose address is this host's, the laboratory first.
+
+    In lock step they wait `awaited` seconds (wall time) for a coordinator that died.
+    """
     local = sorted((n for n in directory.nodes.values() if is_local(n.host)), key=lambda node: not node.sim)
     options = ["--services", str(directory.source), *(["--lockstep"] if lockstep else [])]
+    options += ["--await-coordinator", str(awaited)] if lockstep and awaited else []
     scripted = ["--mock", str(mock)] if mock else []
     return [
         Program(node.name, [sys.executable, "-m", "sim", *options], first=True)

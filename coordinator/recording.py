@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 import zlib
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,15 +51,18 @@ class JournalStore:
             "marking": list(state.marking),
             "instructions": digest(instructions),
         }
-        self.writer.append(STIMULUS, data)
+        self._write(STIMULUS, data)
+
+    def _write(self, kind: str, data: Mapping[str, Any]) -> None:
+        self.writer.append(kind, data)
 
     def node(self, name: str, boot: str) -> None:
         """Keep which boot of a node was spoken to: after a resume another boot is never asked to run a call again."""
-        self.writer.append(NODE, {"node": name, "boot": boot})
+        self._write(NODE, {"node": name, "boot": boot})
 
     def stage(self, name: str, values: Mapping[str, Any]) -> None:
         """Keep that the mission run has come to a stage of its own: what follows it does not happen again after a resume."""
-        self.writer.append(STAGE, {"stage": name, "values": dict(values)})
+        self._write(STAGE, {"stage": name, "values": dict(values)})
 
     def flush(self) -> None:
         """What was appended survives the end of this process."""
@@ -76,6 +80,37 @@ class JournalStore:
 
 class ReplayError(Exception):
     """What the engine does now differs from what the journal says it did: number of the record, and both."""
+
+
+class RetracingStore(JournalStore):
+    """The store of a lock-step run that is made again from its beginning: the same seed gives the same run, so what the journal
+    holds already is compared, and what comes after it is written. Raises ReplayError at the first difference.
+    """
+
+    def __init__(self, writer: JournalWriter, journal: Journal) -> None:
+        super().__init__(writer, 0.0)
+        self._path = journal.path
+        self._expected = deque(record for record in journal.records if record.kind != EPOCH)
+
+    def _write(self, kind: str, data: Mapping[str, Any]) -> None:
+        if not self._expected:
+            super()._write(kind, data)
+            return
+        then = self._expected.popleft()
+        if (then.kind, _unmeasured(then.data)) != (kind, _unmeasured(data)):
+            raise ReplayError(
+                f"{self._path}: record {then.number} was {then.kind} {then.data}, is {kind} {data} now: sources or files have "
+                "changed since; run it anew"
+            )
+
+
+def _unmeasured(data: Mapping[str, Any]) -> Any:
+    """A record without what differs between two equal runs: measured times, and a score's own words."""
+    plain = msgpack.unpackb(msgpack.packb(dict(data), use_bin_type=True), raw=False, strict_map_key=False)
+    plain.pop("values", None)
+    if isinstance(plain.get("stimulus"), dict):
+        plain["stimulus"].pop("cpu_seconds", None)
+    return plain
 
 
 @dataclass(frozen=True, slots=True)

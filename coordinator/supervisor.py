@@ -109,6 +109,10 @@ class Supervisor:
                 _signal(child, signal.SIGKILL)
         await asyncio.gather(*waiting, return_exceptions=True)
 
+    async def ended(self) -> None:
+        """Wait until all programs have ended for good."""
+        await asyncio.wait([child.task for child in self._children if child.task])
+
     def process_ids(self) -> dict[str, int]:
         """Process id of each running program by name."""
         return {c.program.name: c.process.pid for c in self._children if c.process and c.process.returncode is None}

@@ -37,28 +37,49 @@ def run(options: argparse.Namespace) -> int:
     from coordinator.journal import JournalError
     from coordinator.mission import MissionError
     from coordinator.recording import ReplayError
+    from coordinator.runfolder import RESULT
+    from services.comm.cell import CellError
 
     found = recorded(options.run)
-    if found.journal.header["mode"] != "realtime":
-        raise CommandError(2, f"{options.run} was run in lock step: run it again with its seed, it gives the same")
+    folder, mode = found.journal.path.parent, found.journal.header["mode"]
+    if (folder / RESULT).exists():
+        raise CommandError(2, f"{options.run}: the run had ended; its result is {folder / RESULT}")
     begun = time.perf_counter()
     try:
-        mission, timeline, learned = asyncio.run(_resume(found, options))
+        if mode == "lockstep":
+            mission, timeline, learned = _resume_lockstep(found, options)
+        else:
+            mission, timeline, learned = asyncio.run(_resume(found, options))
     except MissionError as fault:
         raise CommandError(1, str(fault)) from fault
+    except CellError as fault:
+        raise CommandError(3, str(fault)) from fault
     except (JournalError, ReplayError) as fault:
         raise CommandError(2, str(fault)) from fault
-    result = {**mission.result("realtime", time.perf_counter() - begun), **learned}
-    give(result, found.task, timeline, options, found.journal.path.parent)
+    result = {**mission.result(mode, time.perf_counter() - begun), **learned}
+    give(result, found.task, timeline, options, folder)
     return 0 if result["status"] == "success" else 1
+
+
+def _resume_lockstep(found: Recorded, options: argparse.Namespace) -> tuple[Mission, Timeline, dict[str, Any]]:
+    """Nodes that wait for their coordinator are joined; a cell that ended with it is made again from its seed."""
+    from coordinator.cli.learning import resumed_selector, saved
+    from coordinator.cli.lockstep import JOINED, rejoin, retrace
+    from coordinator.cli.run import progress
+
+    selector, session = resumed_selector(found.task, found.journal.header)
+    with saved(session, found.journal.header["mission"]) as learned, progress(options) as watch:
+        if found.journal.header["cell"] == JOINED:
+            mission, timeline = rejoin(found, selector, [] if session is None else [session.selector], watch)
+        else:
+            mission, timeline = retrace(found, selector, watch)
+    return mission, timeline, learned
 
 
 async def _resume(found: Recorded, options: argparse.Namespace) -> tuple[Mission, Timeline, dict[str, Any]]:
     from coordinator.cli.learning import resumed_selector, saved
     from coordinator.cli.run import drive
-    from coordinator.engine import Mode
     from coordinator.launch import resumed_mission
-    from coordinator.runfolder import RESULT
     from coordinator.timeline import Timeline
 
     timeline = Timeline()
@@ -66,8 +87,6 @@ async def _resume(found: Recorded, options: argparse.Namespace) -> tuple[Mission
     selector, session = resumed_selector(found.task, found.journal.header)
     observers: list[Observer] = [timeline] if session is None else [timeline, session.selector]
     mission, go_on = resumed_mission(found.directory, found.task, found.engine, found.journal, observers, now, selector)
-    if mission.executor.state.mode is Mode.FINISHED and (found.journal.path.parent / RESULT).exists():
-        raise CommandError(2, f"{options.run}: the run had ended; its result is {found.journal.path.parent / RESULT}")
     options.folder = found.journal.path.parent
     with saved(session, found.journal.header["mission"]) as learned:
         await drive(found.directory, mission, options, go_on)

@@ -7,12 +7,13 @@ import asyncio
 import os
 import sys
 import time
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
+from coordinator.cli.journaling import add_journal_arguments, journal_folder, new_store, tidy
 from coordinator.cli.learning import add_learning_arguments, opened, saved
 from coordinator.cli.loading import add_services_argument, load_directory, load_task, write_json
 
@@ -20,13 +21,11 @@ if TYPE_CHECKING:
     from coordinator.launch import Setting
     from coordinator.mission import Mission
     from coordinator.realtime import RealtimeMission
-    from coordinator.recording import JournalStore
     from coordinator.task import Task
     from coordinator.timeline import Timeline
     from services.comm.directory import Directory
 
 EXAMPLE = "petrobot run catch_ball --mode lockstep --runs 20 --seed 1 --json out.json"
-LONGEST_LOCKSTEP = 1e9
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,19 +47,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--processes", type=int, choices=(1, 0), default=1, help="lock step: 1 for one process, 0 for one a node"
     )
     parser.add_argument(
+        "--join",
+        action="store_true",
+        help="lock step, one process a node: the nodes wait already (`petrobot up --lockstep`)",
+    )
+    parser.add_argument(
         "--up", action="store_true", help="launch the nodes of this host for this run, and end them after it"
     )
     parser.add_argument("--mock", metavar="FILE", type=Path, help="replace actions by scripted ones")
     add_learning_arguments(parser)
     parser.add_argument("--json", metavar="FILE", help="write the result as JSON (- for standard output)")
     parser.add_argument("--report", metavar="FOLDER", type=Path, help="leave a report in this folder")
-    parser.add_argument(
-        "--journal",
-        metavar="FOLDER",
-        type=Path,
-        default=Path("runs"),
-        help="where real-time runs are kept (default: %(default)s)",
-    )
+    add_journal_arguments(parser)
     add_page_arguments(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress in the terminal")
     add_services_argument(parser)
@@ -84,6 +82,8 @@ def run(options: argparse.Namespace) -> int:
     from services.comm.directory import DirectoryError
 
     directory, task = load_directory(options.services), load_task(options.task)
+    if options.join and (options.mode != "lockstep" or options.processes != 0):
+        raise CommandError(2, "--join is for --mode lockstep --processes 0: nodes in real time are joined always")
     _refuse_unfit(task, directory)
     setting = _setting(task, directory, options)
     begun = time.perf_counter()
@@ -101,6 +101,7 @@ def run(options: argparse.Namespace) -> int:
         raise CommandError(2, str(fault)) from fault
     result = {**mission.result(options.mode, time.perf_counter() - begun), **learned}
     give(result, task, timeline, options, options.folder)
+    tidy(options)
     return 0 if result["status"] == "success" else 1
 
 
@@ -138,6 +139,8 @@ def _setting(task: Task, directory: Directory, options: argparse.Namespace) -> S
         if action not in directory.actions:
             raise CommandError(2, f"--use {primitive}={action}: {directory.source} places no action {action}")
     options.learning = opened(task, chosen, options)
+    learning = {} if options.learning is None else {"learning": options.learning.beginning()}
+    options.chosen_by = {"chosen": chosen, **learning}
     selector = FirstAlternative(chosen) if options.learning is None else options.learning.selector
     return Setting(task, parameters, options.runs, options.seed, selector)
 
@@ -165,67 +168,18 @@ def _parameter(task: Task, name: str, text: str) -> Any:
         raise CommandError(2, f"parameter {name}: {text!r} is no {type(default).__name__}") from fault
 
 
-def _substitutes(options: argparse.Namespace, directory: Directory) -> Mapping[str, Callable[..., Any]] | None:
-    if options.mock is None:
-        return None
-    from coordinator.launch import SCRIPTED, load_object
-
-    try:
-        scripted: Mapping[str, Callable[..., Any]] = load_object(SCRIPTED)(options.mock)
-    except OSError as fault:
-        raise CommandError(2, f"{options.mock}: {fault.strerror}") from fault
-    except Exception as fault:
-        raise CommandError(2, str(fault)) from fault
-    for name in scripted:
-        if name not in directory.actions:
-            raise CommandError(2, f"{options.mock}: actions.{name}: {directory.source} has no such action")
-    return scripted
-
-
 # --- lock step ---------------------------------------------------------------------------------------------------------
 
 
 def _run_lockstep(directory: Directory, setting: Setting, options: argparse.Namespace) -> tuple[Mission, Timeline]:
-    from coordinator.launch import lockstep_cell
-    from coordinator.timeline import Timeline
+    from coordinator.cli.lockstep import begin
     from services.comm.cell import CellError
 
-    timeline = Timeline()
-    with _progress(options) as watch:
+    with progress(options) as watch:
         try:
-            if options.processes == 1:
-                cell, party = lockstep_cell(directory, setting, _substitutes(options, directory), watch)
-                party.mission.executor.observers.append(timeline)
-                cell.run(lambda: party.over, int(LONGEST_LOCKSTEP))
-            else:
-                party = asyncio.run(_spread_lockstep(directory, setting, options, timeline, watch))
+            return begin(directory, setting, options, watch)
         except CellError as fault:
             raise CommandError(3, str(fault)) from fault
-    return party.mission, timeline
-
-
-async def _spread_lockstep(
-    directory: Directory,
-    setting: Setting,
-    options: argparse.Namespace,
-    timeline: Timeline,
-    watch: Callable[[Mission, float], None] | None,
-) -> Any:
-    from coordinator.launch import local_programs, lockstep_member
-    from coordinator.supervisor import Supervisor
-
-    member, party = lockstep_member(directory, setting, watch)
-    party.mission.executor.observers.append(timeline)
-    programs = local_programs(directory, lockstep=True, mock=options.mock)
-    supervisor = Supervisor(programs, Path("runs/logs"), respawn=False)
-    async with supervisor:
-        await asyncio.to_thread(_go, member, lambda: party.over)
-    return party
-
-
-def _go(member: Any, until: Callable[[], bool]) -> None:
-    member.open()
-    member.run(until)
 
 
 # --- real time ---------------------------------------------------------------------------------------------------------
@@ -239,41 +193,15 @@ async def _run_realtime(
 
     timeline = Timeline()
     identity: str = options.identity
-    options.folder = options.journal / identity
-    store = _store(directory, setting, options, identity, asyncio.get_running_loop().time())
+    folder = journal_folder(options)
+    assert folder is not None
+    options.folder = folder / identity
+    now = asyncio.get_running_loop().time()
+    store = new_store(directory, setting, options, options.folder, identity, now, **options.chosen_by)
     mission = realtime_mission(directory, setting, identity, store)
     mission.executor.observers.append(timeline)
     await drive(directory, mission, options)
     return mission, timeline
-
-
-def _store(
-    directory: Directory, setting: Setting, options: argparse.Namespace, mission: str, origin: float
-) -> JournalStore:
-    from coordinator.cli.loading import task_path
-    from coordinator.journal import JournalWriter
-    from coordinator.recording import JournalStore, clock_reading
-    from coordinator.runfolder import JOURNAL, header
-
-    services = directory.source.read_text(encoding="utf-8")
-    given = {
-        "services_path": str(directory.source.resolve()),
-        "seed": setting.seed,
-        "runs": with_runs_of(setting),
-        "parameters": {**setting.task.parameters, **setting.parameters},
-        "clock": clock_reading(origin),
-        "chosen": dict(_pairs("--use", options.use)),
-        **({} if options.learning is None else {"learning": options.learning.beginning()}),
-    }
-    first = header(mission, task_path(options.task).read_text(encoding="utf-8"), services, options.mode, given)
-    return JournalStore(JournalWriter(options.journal / mission / JOURNAL, first), origin)
-
-
-def with_runs_of(setting: Setting) -> int:
-    """How many runs a setting asks for."""
-    from coordinator.launch import with_runs
-
-    return with_runs(setting.task, setting.runs)[1]
 
 
 async def drive(
@@ -290,7 +218,7 @@ async def drive(
             try:
                 await shell.connect()
                 async with _page(shell, options):
-                    with _progress(options) as watch:
+                    with progress(options) as watch:
                         await _watched(shell.run(begin), mission, watch)
             finally:
                 await shell.close()
@@ -313,7 +241,7 @@ async def _page(shell: RealtimeMission, options: argparse.Namespace) -> AsyncIte
     selector = shell.mission.executor.selector
     assert isinstance(selector, FirstAlternative)
     operation = Operation(shell, selector)
-    history = JournalHistory(getattr(options, "journal", Path("runs")))
+    history = JournalHistory(options.folder.parent)
     page = await start_page(
         operation, tasks_folder=SHIPPED, port=options.page_port, history=history, page=not options.no_page
     )
@@ -351,7 +279,7 @@ async def _watched(running: Any, mission: Mission, watch: Callable[[Mission, flo
 
 
 @contextmanager
-def _progress(options: argparse.Namespace) -> Iterator[Callable[[Mission, float], None] | None]:
+def progress(options: argparse.Namespace) -> Iterator[Callable[[Mission, float], None] | None]:
     if options.quiet or options.json == "-":
         yield None
         return

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import signal
+from collections.abc import Awaitable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     add_services_argument(parser)
     parser.add_argument("--logs", type=Path, default=Path("runs/logs"), help="folder of the nodes' logs (%(default)s)")
+    parser.add_argument(
+        "--lockstep",
+        action="store_true",
+        help="members of a lock-step cell, for one `petrobot run --join` and its resumes",
+    )
+    parser.add_argument(
+        "--await-coordinator",
+        type=float,
+        default=600.0,
+        metavar="S",
+        help="lock step: how long a coordinator that died is waited for (%(default)g s of wall time)",
+    )
+    parser.add_argument("--mock", metavar="FILE", type=Path, help="replace actions by scripted ones")
     parser.add_argument("--no-respawn", action="store_true", help="leave a node that died dead")
 
 
@@ -33,20 +47,31 @@ async def _up(directory: Directory, options: argparse.Namespace) -> int:
     from coordinator.launch import local_programs
     from coordinator.supervisor import LaunchError, Supervisor
 
-    programs = local_programs(directory)
+    programs = local_programs(
+        directory, lockstep=options.lockstep, mock=options.mock, awaited=options.await_coordinator
+    )
     if not programs:
         raise CommandError(2, f"{directory.source}: none of its nodes has an address of this host")
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    supervisor = Supervisor(programs, options.logs, respawn=not options.no_respawn, notice=print)
+    respawn = not (options.no_respawn or options.lockstep)  # a member that died has left its cell for good
+    supervisor = Supervisor(programs, options.logs, respawn=respawn, notice=print)
     try:
         async with supervisor:
             for name, process in supervisor.process_ids().items():
                 node = directory.nodes[name]
                 print(f"{name:12} ready on {node.host}:{node.port} (process {process})", flush=True)
             print("Ctrl-C stops them all", flush=True)
-            await stop.wait()
+            await _until(stop, supervisor.ended() if options.lockstep else None)
     except LaunchError as fault:
         raise CommandError(3, str(fault)) from fault
     return 0
+
+
+async def _until(stop: asyncio.Event, ended: Awaitable[None] | None) -> None:
+    """Until Ctrl-C, or until all nodes have ended by themselves, as members of a lock-step cell do."""
+    waiting = [asyncio.ensure_future(stop.wait()), *([] if ended is None else [asyncio.ensure_future(ended)])]
+    _, pending = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+    for task in pending:
+        task.cancel()

@@ -1,0 +1,143 @@
+"""How `run` and `resume` drive a lock-step cell: in this process, in one process a node, or with nodes that run already."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from coordinator.cli import CommandError
+
+if TYPE_CHECKING:
+    import argparse
+
+    from coordinator.cli.replaying import Recorded
+    from coordinator.launch import Setting
+    from coordinator.mission import Mission
+    from coordinator.partners import Observer, Selector, Store
+    from coordinator.timeline import Timeline
+    from services.comm.directory import Directory
+
+LONGEST = 10**9
+"""Ticks."""
+LAUNCHED, JOINED = "launched", "joined"
+"""How a recorded run came by its nodes: they ended with it, or they wait for its coordinator."""
+
+Watch = Callable[["Mission", float], None]
+
+
+def begin(
+    directory: Directory, setting: Setting, options: argparse.Namespace, watch: Watch | None
+) -> tuple[Mission, Timeline]:
+    """Run a task in lock step, with a journal if a folder is given for it."""
+    from coordinator.launch import lockstep_member, lockstep_mission
+
+    store = _new_store(directory, setting, options)
+    if options.processes == 1:
+        return in_one_process(directory, setting, substitutes(options.mock, directory), watch, store)
+    mission = lockstep_mission(directory, setting, store)
+    member, party = lockstep_member(directory, mission, watch)
+    timeline = _timed(mission)
+    if options.join:
+        _go(member, lambda: party.over)
+    else:
+        asyncio.run(_launched(directory, options.mock, member, lambda: party.over))
+    return mission, timeline
+
+
+def _new_store(directory: Directory, setting: Setting, options: argparse.Namespace) -> Store | None:
+    from coordinator.cli.journaling import journal_folder, new_store
+    from coordinator.launch import lockstep_id, mission_id
+
+    folder = journal_folder(options)
+    if folder is None:
+        return None
+    options.folder = folder / mission_id(setting.task)
+    more = {"cell": JOINED if options.join else LAUNCHED, **options.chosen_by}
+    return new_store(directory, setting, options, options.folder, lockstep_id(setting), 0.0, **more)
+
+
+def in_one_process(
+    directory: Directory,
+    setting: Setting,
+    substituted: Mapping[str, Callable[..., Any]] | None,
+    watch: Watch | None,
+    store: Store | None,
+) -> tuple[Mission, Timeline]:
+    """The whole cell in this process."""
+    from coordinator.launch import lockstep_cell
+
+    cell, party = lockstep_cell(directory, setting, substituted, watch, store)
+    timeline = _timed(party.mission)
+    cell.run(lambda: party.over, LONGEST)
+    return party.mission, timeline
+
+
+def retrace(found: Recorded, selector: Selector, watch: Watch | None) -> tuple[Mission, Timeline]:
+    """Go on with a run whose cell ended with its coordinator: made again from its seed, compared with the journal as far as that
+    goes, and written on from there."""
+    from coordinator.journal import JournalWriter
+    from coordinator.launch import Setting
+    from coordinator.recording import RetracingStore
+
+    header = found.journal.header
+    store = RetracingStore(JournalWriter(found.journal.path), found.journal)
+    setting = Setting(found.task, header["parameters"], header["runs"], header["seed"], selector)
+    mock = Path(header["mock"]) if header.get("mock") else None
+    return in_one_process(found.directory, setting, substitutes(mock, found.directory), watch, store)
+
+
+def rejoin(
+    found: Recorded, selector: Selector, observers: list[Observer], watch: Watch | None
+) -> tuple[Mission, Timeline]:
+    """Go on with a run whose nodes wait for their coordinator."""
+    from coordinator.launch import lockstep_member, resumed_mission
+    from coordinator.timeline import Timeline
+
+    timeline = Timeline()
+    seen = [timeline, *observers]
+    mission, go_on = resumed_mission(found.directory, found.task, found.engine, found.journal, seen, 0.0, selector)
+    member, party = lockstep_member(found.directory, mission, watch, go_on)
+    _go(member, lambda: party.over)
+    return mission, timeline
+
+
+def substitutes(mock: Path | None, directory: Directory) -> Mapping[str, Callable[..., Any]] | None:
+    """The scripted actions of a file, None without one."""
+    if mock is None:
+        return None
+    from coordinator.launch import SCRIPTED, load_object
+
+    try:
+        scripted: Mapping[str, Callable[..., Any]] = load_object(SCRIPTED)(mock)
+    except OSError as fault:
+        raise CommandError(2, f"{mock}: {fault.strerror}") from fault
+    except Exception as fault:
+        raise CommandError(2, str(fault)) from fault
+    for name in scripted:
+        if name not in directory.actions:
+            raise CommandError(2, f"{mock}: actions.{name}: {directory.source} has no such action")
+    return scripted
+
+
+def _timed(mission: Mission) -> Timeline:
+    from coordinator.timeline import Timeline
+
+    timeline = Timeline()
+    mission.executor.observers.append(timeline)
+    return timeline
+
+
+async def _launched(directory: Directory, mock: Path | None, member: Any, until: Callable[[], bool]) -> None:
+    from coordinator.launch import local_programs
+    from coordinator.supervisor import Supervisor
+
+    programs = local_programs(directory, lockstep=True, mock=mock)
+    async with Supervisor(programs, Path("runs/logs"), respawn=False):
+        await asyncio.to_thread(_go, member, until)
+
+
+def _go(member: Any, until: Callable[[], bool]) -> None:
+    member.open()
+    member.run(until)

@@ -1,0 +1,225 @@
+"""The catching task in lock step with a coordinator that is killed (SIGKILL) at given places of its journal, and resumed each time.
+
+A process for itself, so that it forks from one thread: `mortal_cell.py FOLDER SERVICES SEED RUNS KILLS` with KILLS a JSON list of
+experiments, each a list of numbers: the first life of the coordinator is killed after its n-th operation on the journal (append,
+flush or sync), the next life after its own next number, the last one lives to the end. The laboratory and the nodes live in one
+process of their own, which no kill touches. Prints one JSON line for each experiment.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import signal
+import socket
+import sys
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from coordinator import launch
+from coordinator.cli.loading import load_task
+from coordinator.cli.replaying import recorded
+from coordinator.engine import Engine, Fired, Instruction, RunRecorded, State, Stimulus
+from coordinator.journal import JournalWriter, read_journal
+from coordinator.launch import Setting, lockstep_party, make_mission, resumed_mission, with_runs
+from coordinator.lockstep_party import NAME, CoordinatorParty
+from coordinator.mission import Mission
+from coordinator.recording import JournalStore
+from coordinator.runfolder import header
+from services.comm.cell import Delays
+from services.comm.directory import Directory, load, resolve
+from services.comm.lockstep import Member
+
+CELL = "cell"
+TASK = "catch_ball"
+SURVIVOR = 10**9
+
+
+class MortalStore(JournalStore):
+    """Kills its process at an operation."""
+
+    lives = SURVIVOR
+    operations = 0
+
+    @classmethod
+    def count(cls) -> None:
+        """One operation more; at the last one the process is killed."""
+        cls.operations += 1
+        if cls.operations == cls.lives:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def append(self, now: float, stimulus: Stimulus, instructions: Sequence[Instruction], state: State) -> None:
+        """An append, and perhaps the end."""
+        super().append(now, stimulus, instructions, state)
+        self.count()
+
+    def stage(self, name: str, values: Mapping[str, Any]) -> None:
+        """A stage, and perhaps the end."""
+        super().stage(name, values)
+        self.count()
+
+    def flush(self) -> None:
+        """A flush, and perhaps the end: before it was the end after the append."""
+        unsaved = self.writer.unsaved
+        super().flush()
+        if unsaved:
+            self.count()
+
+    def sync(self) -> None:
+        """A sync, and perhaps the end."""
+        pending = self.writer.pending
+        super().sync()
+        if pending:
+            self.count()
+
+
+def counting(directory: Directory, log: Path) -> dict[str, Callable[..., Any]]:
+    """Every action as it is, but that each execution leaves its call id in a file."""
+
+    def wrapped(name: str) -> Callable[..., Any]:
+        action = resolve(directory.actions[name].run)
+
+        @functools.wraps(action)
+        def counted(ctx: Any, **arguments: Any) -> Any:
+            with log.open("a", encoding="utf-8") as file:
+                file.write(ctx.run + "\n")
+            return action(ctx, **arguments)
+
+        return counted
+
+    return {name: wrapped(name) for name in directory.actions}
+
+
+class Experiment:
+    """One mission run with its kills."""
+
+    def __init__(self, folder: Path, services: Path, seed: int, runs: int) -> None:
+        self.folder = folder
+        self.directory = load(services)
+        self._seed = seed
+        self.task, self.runs = with_runs(load_task(TASK), runs)
+        folder.mkdir(parents=True)
+        self._log = folder / "executed.txt"
+        self._log.touch()
+        ports = [socket.create_server(("127.0.0.1", 0)) for _ in range(2)]
+        self._addresses = dict(zip((CELL, NAME), (one.getsockname() for one in ports), strict=True))
+        for port in ports:
+            port.close()
+        self._hosts = {**dict.fromkeys(self.directory.nodes, CELL), NAME: NAME}
+
+    def run(self, kills: Sequence[int]) -> dict[str, Any]:
+        """Live through all kills; what came of it."""
+        cell = _fork(self._cell)
+        for life, lives in enumerate([*kills, SURVIVOR]):
+            status = os.waitpid(_fork(functools.partial(self._coordinate, lives, life > 0)), 0)[1]
+            killed = os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL
+            if not killed:
+                break
+        assert os.waitpid(cell, 0)[1] == 0, "the cell's process failed"
+        assert status == 0, f"the coordinator's process failed: {status}"
+        return {
+            "kills": list(kills),
+            "lives": life + 1,
+            **json.loads((self.folder / "outcome.json").read_text()),
+            **self._book(),
+        }
+
+    def _member(self, name: str, parties: Sequence[Any], **more: Any) -> Member:
+        delays = Delays(self.directory.delays())
+        return Member(
+            name, parties, self._addresses, hosts=self._hosts, delays=delays, directory=self.directory.hash, **more
+        )
+
+    def _cell(self) -> None:
+        counted = counting(self.directory, self._log)
+        parties = [lockstep_party(self.directory, node, counted) for node in self.directory.nodes.values()]
+        member = self._member(CELL, parties, returning={NAME})
+        member.open()
+        member.run()
+
+    def _coordinate(self, lives: int, again: bool) -> None:
+        MortalStore.lives, MortalStore.operations = lives, 0
+        launch.__dict__["JournalStore"] = MortalStore
+        mission, begin = self._resumed() if again else (self._new(), None)
+        party = CoordinatorParty(self.directory, mission, begin=begin)
+        member = self._member(NAME, [party], rejoins=again)
+        member.open()
+        member.run(lambda: party.over)
+        (self.folder / "outcome.json").write_text(json.dumps(self._outcome(mission)))
+
+    def _new(self) -> Mission:
+        setting = Setting(self.task, runs=self.runs, seed=self._seed)
+        given = {"services_path": str(self.directory.source), "seed": self._seed, "runs": self.runs}
+        text = Path(launch.__file__).with_name("tasks").joinpath(f"{TASK}.toml").read_text(encoding="utf-8")
+        services = self.directory.source.read_text(encoding="utf-8")
+        first = header("m", text, services, "lockstep", {**given, "parameters": dict(self.task.parameters)})
+        store = MortalStore(JournalWriter(self.folder / "run.journal", first), 0.0)
+        return make_mission(self.directory, setting, "m", "lock step", store)
+
+    def _resumed(self) -> tuple[Mission, Callable[[float], None]]:
+        journal = read_journal(self.folder / "run.journal")
+        devices = {a.name: a.device for a in self.directory.actions.values() if a.device}
+        return resumed_mission(self.directory, self.task, Engine(self.task, devices), journal, [], 0.0)
+
+    def _outcome(self, mission: Mission) -> dict[str, Any]:
+        """What a kill must not change, and how many operations there are to be killed at."""
+        finished = mission.executor.finished
+        assert finished is not None
+        return {
+            "operations": MortalStore.operations,
+            "same": {
+                "status": finished.status.value,
+                "marking": list(mission.executor.state.marking),
+                "cycles": [cycle.status.value for cycle in mission.tally.cycles],
+                "caught": [throw["caught"] for throw in mission.score["throws"]],
+                "runs": sorted((r.place, str(r.status)) for r in mission.tally.runs),
+            },
+        }
+
+    def _book(self) -> dict[str, Any]:
+        """What the journal and the nodes say of the calls: executed how often, unknown, and every firing one of the net."""
+        executed = Counter(self._log.read_text(encoding="utf-8").split())
+        found = recorded(str(self.folder))
+        given = [i for step in found.steps() for i in step.instructions]
+        firings = [one for one in given if isinstance(one, Fired)]
+        markings = list(found.task.flat.net.replay([f.transition for f in firings], firings[0].before))
+        assert [tuple(m) for m in markings[1:]] == [f.after for f in firings], (
+            "a firing that the ordinary net does not allow"
+        )
+        records = [one for one in given if isinstance(one, RunRecorded)]
+        return {
+            "calls": len(executed),
+            "twice": sorted(call for call, times in executed.items() if times > 1),
+            "unknown": [r.run for r in records if r.executed.value == "unknown"],
+            "recorded": len(records),
+        }
+
+
+def _fork(work: Callable[[], None]) -> int:
+    """A child process that does this work; its id."""
+    child = os.fork()
+    if child:
+        return child
+    code = 1
+    try:
+        work()
+        code = 0
+    except BaseException as fault:
+        print(f"{work}: {type(fault).__name__}: {fault}", file=sys.stderr, flush=True)
+    finally:
+        os._exit(code)
+
+
+def main() -> None:
+    """All experiments, one after the other."""
+    folder, services, seed, runs, kills = sys.argv[1:]
+    for number, experiment in enumerate(json.loads(kills)):
+        outcome = Experiment(Path(folder) / str(number), Path(services), int(seed), int(runs)).run(experiment)
+        print(json.dumps(outcome), flush=True)
+
+
+if __name__ == "__main__":
+    main()
