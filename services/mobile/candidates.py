@@ -98,7 +98,9 @@ def ridges(grid: ScanGrid, samples: Grey, width: float) -> Candidates:
     peak = middle > contrast_threshold(samples)
     for shift in range(1, reach + 1):
         end = strength.shape[1] - reach
-        peak &= (middle >= strength[:, reach - shift : end - shift]) & (middle > strength[:, reach + shift :][:, : middle.shape[1]])
+        peak &= (middle >= strength[:, reach - shift : end - shift]) & (
+            middle > strength[:, reach + shift :][:, : middle.shape[1]]
+        )
     row, column = np.nonzero(peak)
     around = strength[row[:, None], column[:, None] + np.arange(2 * reach + 1)[None, :]]
     offsets = (np.arange(2 * reach + 1) - reach) * grid.step

@@ -27,6 +27,8 @@ STEEPEST = 1.6
 """Slope against straight ahead beyond which rows cut the line too slantingly."""
 FIRST_SLOPE = 0.9
 """Steepest slope that a line that was not expected may begin with."""
+SURELY = 0.45
+"""m of line from an expected beginning after which no other is tried."""
 SHORTEST = 0.16
 """m of line that count as one."""
 
@@ -82,7 +84,9 @@ def chain(grid: ScanGrid, candidates: Candidates, expected: Line | None) -> Sigh
     begun = _seeds(grid, rows, expected)
     best: _Chain | None = None
     for seed, first in begun:
-        _grow(seed, first, grid, rows)
+        _grow(seed, first, grid.rows, rows)
+        if expected is not None and seed.length > SURELY:
+            return _sight(grid, seed)
         if seed.length >= SHORTEST and (best is None or _worth(seed) > _worth(best)):
             best = seed
     return _sight(grid, best) if best is not None else UNSEEN
@@ -98,7 +102,7 @@ def _by_row(grid: ScanGrid, candidates: Candidates) -> list[list[float]]:
 def _seeds(grid: ScanGrid, rows: list[list[float]], expected: Line | None) -> list[tuple[_Chain, int]]:
     """Beginnings of lines with the row after which each goes on."""
     seeds: list[tuple[_Chain, int]] = []
-    x = grid.x.tolist()
+    x = grid.rows
     if expected is not None:
         for i, places in enumerate(rows):
             if x[i] > expected.near + 0.45 or len(seeds) == 3:
@@ -119,7 +123,7 @@ def _seeds(grid: ScanGrid, rows: list[list[float]], expected: Line | None) -> li
     return seeds
 
 
-def _pairs_on(x: list[float], rows: list[list[float]], i: int, y: float) -> list[tuple[_Chain, int]]:
+def _pairs_on(x: tuple[float, ...], rows: list[list[float]], i: int, y: float) -> list[tuple[_Chain, int]]:
     """Lines from a place to each place of the next rows that is not too far aside."""
     for j in range(i + 1, min(i + 4, len(x))):
         slopes = [(other - y) / (x[j] - x[i]) for other in rows[j]]
@@ -129,8 +133,7 @@ def _pairs_on(x: list[float], rows: list[list[float]], i: int, y: float) -> list
     return []
 
 
-def _grow(line: _Chain, first: int, grid: ScanGrid, rows: list[list[float]]) -> None:
-    x = grid.x.tolist()
+def _grow(line: _Chain, first: int, x: tuple[float, ...], rows: list[list[float]]) -> None:
     for i in range(first, len(x)):
         onwards = x[i] - line.x[-1]
         if onwards > GAP or abs(line.slope) > STEEPEST:
@@ -138,7 +141,7 @@ def _grow(line: _Chain, first: int, grid: ScanGrid, rows: list[list[float]]) -> 
         wanted = line.ahead(x[i])
         places = rows[i]
         if places:
-            y = min(places, key=lambda place: abs(place - wanted))  # noqa: B023 - used at once
+            y = min(places, key=lambda place: abs(place - wanted))
             if abs(y - wanted) <= STEP_GATE + STEP_SLOPE * onwards:
                 line.add(x[i], y)
 
@@ -207,14 +210,18 @@ def _plausible(grid: ScanGrid, found: Candidates, expected: Line | None) -> NDAr
     keep: NDArray[np.bool_] = x <= (x.min() + WINDOW if x.size else 0.0)
     if expected is not None:
         d = x - expected.near
-        keep &= np.abs(expected.offset + expected.slope * d + 0.5 * expected.bend * d * d - found.y) < 1.5 * GATE + 0.3 * d
+        keep &= (
+            np.abs(expected.offset + expected.slope * d + 0.5 * expected.bend * d * d - found.y) < 1.5 * GATE + 0.3 * d
+        )
     return keep
 
 
 def _through(x: Vector, y: Vector, picks: NDArray[np.int64]) -> Vector:
     """Parabolas [c0, c1, c2] through triples of points that are apart, not too steep and not too bent (k, 3)."""
     px, py = x[picks], y[picks]
-    apart = np.minimum(np.minimum(np.abs(px[:, 0] - px[:, 1]), np.abs(px[:, 1] - px[:, 2])), np.abs(px[:, 0] - px[:, 2]))
+    apart = np.minimum(
+        np.minimum(np.abs(px[:, 0] - px[:, 1]), np.abs(px[:, 1] - px[:, 2])), np.abs(px[:, 0] - px[:, 2])
+    )
     ok = apart > 0.05
     px, py = px[ok], py[ok]
     if px.size == 0:

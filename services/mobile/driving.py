@@ -12,7 +12,6 @@ from typing import Any, Final
 
 from services.action import Cancelled, Context, Result, error, failure, success
 from services.mobile import paths
-from services.mobile.model import nominal_rover
 from services.mobile.odometry import Pose, turned
 from services.mobile.sight import TrackEnd
 
@@ -63,7 +62,9 @@ async def enable_drives(ctx: Context, *, timeout: float = 8.0, forget: bool = Fa
     return success()
 
 
-async def follow_feed_forward(ctx: Context, *, speed: float = 0.5, timeout: float = 240.0, patience: float = 6.0) -> Result:
+async def follow_feed_forward(
+    ctx: Context, *, speed: float = 0.5, timeout: float = 240.0, patience: float = 6.0
+) -> Result:
     """Follow the track to its end by its own curvature plus PD on the error at the axle. See `_follow`."""
     return await _follow(ctx, "feed_forward", speed, timeout, patience)
 
@@ -74,13 +75,13 @@ async def follow_pursuit(ctx: Context, *, speed: float = 0.5, timeout: float = 2
 
 
 async def home_on_reflector(
-    ctx: Context, *, line_end: Sequence[float], speed: float = 0.5, timeout: float = 25.0
+    ctx: Context, *, line_end: Sequence[float] | None = None, speed: float = 0.5, timeout: float = 25.0
 ) -> Result:
     """Recover the track by the reflector above the point where it resumes: drive the circle through it. See `_recover`.
 
     FAILURE `no_reflector` when none answers from where the track can resume.
     """
-    end, gates = _geometry(line_end)
+    end, gates = _geometry(ctx, line_end)
     where: tuple[float, float] | None = None
 
     def found() -> bool:
@@ -101,31 +102,41 @@ async def home_on_reflector(
 
 
 async def dead_reckon(
-    ctx: Context, *, line_end: Sequence[float], speed: float = 0.5, curvature: float = 0.0, timeout: float = 25.0
+    ctx: Context,
+    *,
+    line_end: Sequence[float] | None = None,
+    speed: float = 0.5,
+    curvature: float = 0.0,
+    timeout: float = 25.0,
 ) -> Result:
     """Recover the track by driving on along the curve that the missing element is expected to have. See `_recover`.
 
     `curvature` (1/m, to the left positive): 0 expects a straight, 1 or -1 a quarter arc.
     """
-    end, gates = _geometry(line_end)
+    end, gates = _geometry(ctx, line_end)
     drive = _Drive(ctx, "feed_forward", speed, timeout)
     stuck = await drive.start(gates)
     if stuck is not None:
         return stuck
-    square = nominal_rover().track.square
+    square, _ = ctx.device.state["element"]
     length = square if curvature == 0.0 else 0.5 * math.pi / abs(curvature)
     last = Pose(*paths.arc(end, curvature, length)[-1], end.heading + curvature * length)
     return await _along(drive, paths.arc(end, curvature, length) + paths.arc(last, 0.0, BEYOND - 0.2))
 
 
 async def search_pattern(
-    ctx: Context, *, line_end: Sequence[float], speed: float = 0.4, rate: float = 1.2, timeout: float = 60.0
+    ctx: Context,
+    *,
+    line_end: Sequence[float] | None = None,
+    speed: float = 0.4,
+    rate: float = 1.2,
+    timeout: float = 60.0,
 ) -> Result:
     """Recover the track by going into the empty square and looking straight on, to the left and to the right.
 
     Needs no sensor and no guess, and finds the way back from a wrong guess; takes longest. See `_recover`.
     """
-    end, gates = _geometry(line_end)
+    end, gates = _geometry(ctx, line_end)
     drive = _Drive(ctx, "feed_forward", speed, timeout)
     stuck = await drive.start(gates)
     if stuck is not None:
@@ -156,7 +167,9 @@ async def stop_at_t(ctx: Context, *, line_end: Sequence[float], speed: float = 0
     x, y, _ = ctx.device.state["pose"]
     ahead, aside = end.body(x, y)
     if not (-0.1 < ahead < 0.3 and abs(aside) < 0.3):
-        return failure("off_the_t", f"stands {ahead:.2f} m beyond and {aside:.2f} m beside the T", ahead=ahead, aside=aside)
+        return failure(
+            "off_the_t", f"stands {ahead:.2f} m beyond and {aside:.2f} m beside the T", ahead=ahead, aside=aside
+        )
     return success(ahead=ahead, aside=aside)
 
 
@@ -234,7 +247,9 @@ async def _go(drive: _Drive, to: Pose, rate: float) -> Result | None:
         if ended is not None:
             return ended
         x, y, _ = ctx.device.state["pose"]
-        await _command(ctx, {"do": "forget"})  # the way leads off the line: what was seen of it would pull the rover back
+        await _command(
+            ctx, {"do": "forget"}
+        )  # the way leads off the line: what was seen of it would pull the rover back
     await _command(ctx, {"do": "plan", "points": [(x, y), *paths.straight((x, y), (to.x, to.y))]})
 
     def judge(state: Mapping[str, Any]) -> Result | None:
@@ -317,11 +332,11 @@ class _Drive:
         return error("timeout", f"nothing came of it in {timeout:.1f} s")
 
 
-def _geometry(line_end: Sequence[float]) -> tuple[Pose, tuple[Pose, Pose, Pose]]:
-    """The line's end and where the track can resume."""
-    track = nominal_rover().track
-    end = Pose(*map(float, line_end))
-    return end, paths.resume_poses(end, track.square, track.radius)
+def _geometry(ctx: Context, line_end: Sequence[float] | None) -> tuple[Pose, tuple[Pose, Pose, Pose]]:
+    """The line's end (where the rover is, if none was ever known) and where the track can resume."""
+    state = ctx.device.state
+    end = Pose(*map(float, state["pose"] if line_end is None else line_end))
+    return end, paths.resume_poses(end, *state["element"])
 
 
 def _marked(reflectors: Sequence[Sequence[float]], gates: Sequence[Pose]) -> tuple[float, float] | None:

@@ -81,6 +81,8 @@ class ScanGrid:
     """(rows, columns): whether the image shows the spot."""
     _at: NDArray[np.intp]
     _part: Grey
+    rows: tuple[float, ...]
+    """`x` as plain numbers."""
 
     @staticmethod
     def of(view: FloorView, far: float, spacing: float = 0.03, step: float = 0.00625, reach: float = 0.6) -> ScanGrid:
@@ -95,13 +97,13 @@ class ScanGrid:
                 last = distances[row]
         x = distances[rows]
         count = round(reach / step)
-        y = np.arange(-count, count + 1) * step
+        y = np.arange(-count, count + 1, dtype=np.float64) * np.float64(step)
         u, _ = view.pixels(x[:, None], y[None, :])
         seen = (u >= 0.0) & (u <= view.width - 1.001)
         u = np.clip(u, 0.0, view.width - 1.001)
         column = u.astype(np.intp)
         at = np.asarray(rows, dtype=np.intp)[:, None] * view.width + column
-        return ScanGrid(x, y, seen, at, (u - column).astype(np.float32))
+        return ScanGrid(x, y, seen, at, (u - column).astype(np.float32), tuple(x.tolist()))
 
     @property
     def step(self) -> float:

@@ -32,12 +32,14 @@ class PurePursuit:
 
     def curvature(self, look: Look, speed: float) -> float | None:
         """1/m, None where the line is not known at that distance."""
-        x = self.distance
-        for _ in range(3):
-            fit = look(x)
+        x, fit = self.distance, look(self.distance)
+        for _ in range(2):
             if fit is None:
                 return None
             x = math.sqrt(max(0.04, self.distance**2 - fit.y**2))
+            fit = look(x)
+        if fit is None:
+            return None
         return capped(2.0 * fit.y / (x * x + fit.y * fit.y), TIGHTEST)
 
 

@@ -50,7 +50,7 @@ class EndFinder:
             return None
         x, y, direction = _last(sight)
         grey = self._patch(image, x, y, direction)
-        valid = ~np.isnan(grey).any(axis=1)
+        valid: NDArray[np.bool_] = np.logical_not(np.isnan(grey).any(axis=1))
         if int(valid.sum()) < 2 * NEEDED:
             return None
         least = max(LEAST_CONTRAST, CONTRAST_SHARE * float(grey[valid].max() - grey[valid].min()))
@@ -73,7 +73,7 @@ class EndFinder:
         return self._view.sample(image, x + s * cos - t * sin, y + s * sin + t * cos)
 
     def _stripe(self, grey: Grey, valid: NDArray[np.bool_], least: float) -> tuple[float | None, bool]:
-        """Where a crossbar's middle meets the line (m from its last point), None if there is none; and whether much looks like one."""
+        """Where a crossbar's middle meets the line (m from its last point), None without one; and whether much looks like one."""
         side = round(self._bar / STEP)
         core = (grey[:, :-2] + grey[:, 1:-1] + grey[:, 2:]) / np.float32(3.0)
         left, right = core[:, side:-side] - core[:, : -2 * side], core[:, side:-side] - core[:, 2 * side :]

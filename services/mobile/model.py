@@ -126,7 +126,7 @@ def _number(table: Mapping[str, Any], name: str, key: str, source: str) -> Any:
         if isinstance(value, list) and len(value) == 2 and all(_positive(v) for v in value):
             return float(value[0]), float(value[1])
         raise ModelError(f"{source}: [{name}] {key} = {value!r}: give two positive numbers, column and row in pixels")
-    if not _positive(value):
+    if value is None or not _positive(value):
         raise ModelError(f"{source}: [{name}] {key} = {value!r}: a positive number is needed")
     return float(value)
 

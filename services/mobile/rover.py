@@ -136,6 +136,7 @@ class Rover:
             "refused": self._map.refused,
             "stream_age": self._setpoint.age,
             "reflectors": self._reflectors.believed(self._now),
+            "element": (self.numbers.track.square, self.numbers.track.radius),
             "sensor": self._master.sensor_alive,
             "limited": self._master.limited,
             "faults": [(t.cause, t.wheel, t.code, t.text) for t in self._master.troubles],
@@ -326,8 +327,8 @@ class Rover:
         if place is None or not (self._map.complete or self._reason):
             return None
         pose = self._odometry.pose
-        x, y = pose.body(*place)
-        fit = self._map.fit(pose, x, END_REACH)
+        ahead, _ = pose.body(*place)
+        fit = self._map.fit(pose, ahead, END_REACH)
         return None if fit is None else (*place, pose.heading + fit.heading)
 
     def _regained(self) -> bool:

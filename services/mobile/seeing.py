@@ -24,7 +24,10 @@ PATCHY: Final = 0.9
 
 
 async def find_edges(ctx: Context, *, timeout: float = 30.0, image_timeout: float = 0.5) -> Result:
-    """Find the track by pairs of edges: cheapest. SUCCESS when three images in a row show a line; ERROR `no_line` after `timeout` s."""
+    """Find the track by pairs of edges: cheapest.
+
+    SUCCESS when three images in a row show a line; ERROR `no_line` after `timeout` s.
+    """
     return await _find(ctx, detect_edges, timeout, image_timeout)
 
 
@@ -80,7 +83,9 @@ async def _find(ctx: Context, detector: Detector, timeout: float, image_timeout:
             row = row + 1 if sight.seen else 0
             if row == CONFIRMED:
                 line = sight.describe()
-                return success(images=watcher.images, offset=line.offset, heading=line.heading, curvature=line.curvature)
+                return success(
+                    images=watcher.images, offset=line.offset, heading=line.heading, curvature=line.curvature
+                )
     except Cancelled:
         ctx.withdraw(STREAM)
         raise

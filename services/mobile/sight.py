@@ -90,7 +90,8 @@ class Line:
     @property
     def curvature(self) -> float:
         """At `near` (1/m, to the left positive)."""
-        return self.bend / (1.0 + self.slope * self.slope) ** 1.5
+        steep = 1.0 + self.slope * self.slope
+        return self.bend / (steep * math.sqrt(steep))
 
     def at(self, x: float) -> float:
         """y at a distance x (m)."""
@@ -145,7 +146,9 @@ class TrackAhead:
         """From numbers that their sender has stood by for `held` s. Raises ValueError when they are none."""
         rest = len(values) - HEAD
         if rest < 0 or rest % 2 or rest // 2 > STREAMED or not all(map(math.isfinite, values)):
-            raise ValueError(f"{len(values)} numbers are no set point of track_ahead: {HEAD} and up to {STREAMED} pairs")
+            raise ValueError(
+                f"{len(values)} numbers are no set point of track_ahead: {HEAD} and up to {STREAMED} pairs"
+            )
         age, confidence, kind, x, y = values[:HEAD]
         if kind not in tuple(TrackEnd) or age < 0.0:
             raise ValueError(f"track_ahead: age {age}, end {kind}: not a set point")

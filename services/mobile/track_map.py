@@ -58,7 +58,8 @@ class Fit:
     @property
     def curvature(self) -> float:
         """1/m, to the left positive."""
-        return self.bend / (1.0 + self.slope * self.slope) ** 1.5
+        steep = 1.0 + self.slope * self.slope
+        return self.bend / (steep * math.sqrt(steep))
 
 
 class TrackMap:
@@ -82,10 +83,6 @@ class TrackMap:
         self._local: tuple[Pose, tuple[Vector, Vector, Vector, int]] | None = None
         self._gates: tuple[Pose, ...] = ()
         self._looks = True
-
-    def clear(self) -> None:
-        """Forget everything."""
-        self.__init__()  # type: ignore[misc]
 
     def begin(self, gates: Sequence[Pose] = (), *, look: bool = True) -> None:
         """A new stretch begins: what lies behind stays for the axle to pass over, the end of the last one is forgotten.

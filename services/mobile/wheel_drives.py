@@ -109,9 +109,7 @@ class WheelLink:
             Transfer(Object.SYNC_PERIOD, 0, _U32, round(cycle * 1e6)),
             Transfer(Object.MODE, 0, _I8, Mode.CYCLIC_SYNCHRONOUS_VELOCITY),
             Transfer(Object.QUICK_STOP_DECELERATION, 0, _U32, to_units(self._quick_stop)),
-            *canopen.map_pdo(
-                Object.RPDO1, Object.RPDO1_MAPPING, canopen.RPDO1_BASE + self.node, 1, VELOCITY_RECEIVED
-            ),
+            *canopen.map_pdo(Object.RPDO1, Object.RPDO1_MAPPING, canopen.RPDO1_BASE + self.node, 1, VELOCITY_RECEIVED),
             *canopen.map_pdo(Object.TPDO1, Object.TPDO1_MAPPING, canopen.TPDO1_BASE + self.node, 1, SENT),
         ]
 
