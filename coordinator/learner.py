@@ -1,8 +1,8 @@
 """The executor's selector that learns: it turns the executor's records into records of learning, and chooses by them.
 
 It stands on two sides of the executor: as its `Selector` it is asked for actions, as an `Observer` it sees everything that
-happens. Times are kept to the microsecond, as journals keep them. Its state changes by what it observes alone, never by being asked; so a resumed run, whose recorded steps are shown to
-it again, has the same state as one that was never interrupted.
+happens. Its state changes by what it observes alone, never by being asked, and times are kept to the microsecond, as journals
+keep them; so a resumed run, whose recorded steps are shown to it again, has the same state as one that was never interrupted.
 """
 
 from __future__ import annotations
@@ -140,6 +140,20 @@ class LearningSelector(FirstAlternative):
         context = self.contexts.of(self._values if variables is None else variables)
         rng = np.random.default_rng([self._seed, self._generation, 1, *run.encode()])
         return self.learning.choose(task, context, alternatives, rng)
+
+    def figures(self, task: str) -> Mapping[str, Mapping[str, float]]:
+        """Probability of each alternative in the context now, and its R, C and J where they are known."""
+        selector = self.learning.selectors.get(task)
+        if selector is None:
+            return {}
+        batch, shares = selector.learner(self.context), selector.probabilities(self.context)
+        known = {"reliability": batch.reliability(), "cost": batch.mean_cost(), "j": batch.objective()}
+        shown: dict[str, dict[str, float]] = {}
+        for i, action in enumerate(selector.actions):
+            shown[action] = {"probability": shares[action]}
+            if batch.runs[0, i] > 0:
+                shown[action] |= {name: float(values[0, i]) for name, values in known.items()}
+        return shown
 
     # --- observer --------------------------------------------------------------------------------------------------
 

@@ -20,6 +20,7 @@ from coordinator.engine import (
     RemoveTokens,
     Report,
     Resume,
+    RunRecorded,
     SetBreakpoints,
     State,
     Step,
@@ -72,9 +73,13 @@ class Operation:
     # --- an observer of the executor -------------------------------------------------------------------------------
 
     def instruction(self, now: float, instruction: Instruction) -> None:
-        """Keep what the engine refuses, for the answer to the command."""
+        """Keep what the engine refuses, for the answer to the command; show what was learned of a run's end."""
         if isinstance(instruction, Report) and instruction.key in REFUSED:
             self._refusals.append(instruction.text)
+        elif isinstance(instruction, RunRecorded) and self._selector.figures(instruction.primitive_task):
+            name = instruction.primitive_task
+            selector = {**self.feed.state["selectors"].get(name, {}), "alternatives": self._alternatives(name)}
+            self.feed.emit("selector", name=name, selector=selector)
 
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
         """Nothing to keep."""
@@ -204,10 +209,13 @@ class Operation:
         return {"ok": True}
 
     def _selectors(self) -> dict[str, Any]:
-        tasks = self.executor.task.primitive_tasks
         return {
-            n: {"alternatives": [{"action": a} for a in p.alternatives], "override": None} for n, p in tasks.items()
+            n: {"alternatives": self._alternatives(n), "override": None} for n in self.executor.task.primitive_tasks
         }
+
+    def _alternatives(self, task: str) -> list[dict[str, Any]]:
+        figures = self._selector.figures(task)
+        return [{"action": a, **figures.get(a, {})} for a in self.executor.task.primitive_tasks[task].alternatives]
 
     def _order(self, stimulus: Stimulus) -> Answer:
         if self.mission.stage is not Stage.RUNNING:

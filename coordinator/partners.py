@@ -97,6 +97,10 @@ class FirstAlternative:
         if action is not None:
             self._overridden[task] = action
 
+    def figures(self, task: str) -> Mapping[str, Mapping[str, float]]:
+        """What people are shown of each alternative: nothing is known here."""
+        return {}
+
     def choose(
         self, task: str, run: str, alternatives: tuple[str, ...], variables: Mapping[str, Any] | None = None
     ) -> tuple[str, str]:

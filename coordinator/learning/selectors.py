@@ -73,12 +73,17 @@ class RuleSelector:
         self.learners: dict[str, Batch] = {}
 
     def learner(self, context: str) -> Batch:
-        """The learner of a context; a fresh one at its first use."""
-        if context not in self.learners:
-            batch = self.rule.begin(1, len(self.actions), self.question.rho)
-            batch.own["admitted"] = np.zeros((1, len(self.actions)))
-            self.learners[context] = batch
-        return self.learners[context]
+        """The learner of a context; one that knows nothing if it has learned nothing yet (it is not kept then)."""
+        return self.learners[context] if context in self.learners else self._fresh(self.actions)
+
+    def _kept(self, context: str) -> Batch:
+        """The learner of a context, to be taught."""
+        return self.learners.setdefault(context, self.learner(context))
+
+    def _fresh(self, actions: Sequence[str]) -> Batch:
+        batch = self.rule.begin(1, len(actions), self.question.rho)
+        batch.own["admitted"] = np.zeros((1, len(actions)))
+        return batch
 
     # --- choosing --------------------------------------------------------------------------------------------------
 
@@ -139,7 +144,7 @@ class RuleSelector:
     def chosen(self, context: str, action: str) -> None:
         """Count a choice."""
         if not self.frozen and action in self.actions:
-            self.learner(context).choosing(np.array([self.actions.index(action)]))
+            self._kept(context).choosing(np.array([self.actions.index(action)]))
 
     def update(self, context: str, action: str, outcome: Observation) -> None:
         """Learn from a run; a censored one teaches nothing."""
@@ -148,7 +153,7 @@ class RuleSelector:
             return
         if outcome.executed is Executed.NO and not missing:
             return
-        batch = self.learner(context)
+        batch = self._kept(context)
         trial = Trial(
             np.array([self.actions.index(action)]),
             np.array([float(outcome.status is Status.SUCCESS)]),
@@ -171,14 +176,14 @@ class RuleSelector:
         if self.frozen or action not in self.actions:
             return
         change = float(status is Status.SUCCESS) - float(was is Status.SUCCESS)
-        batch, i = self.learner(context), self.actions.index(action)
+        batch, i = self._kept(context), self.actions.index(action)
         batch.successes[0, i] = max(0.0, batch.successes[0, i] + change)
 
     def prime(self, context: str, tallies: Mapping[str, Tally]) -> None:
         """Take the sums over from estimates (other machines' runs came in); rules that fade their sums keep their own."""
         if self.frozen or isinstance(self.rule, Tracking):
             return
-        batch = self.learner(context)
+        batch = self._kept(context)
         for i, action in enumerate(self.actions):
             tally = tallies.get(action, Tally())
             cost, missing = tally.cost(self.question.measure), sum(tally.not_executed.values())
@@ -212,14 +217,13 @@ class RuleSelector:
         self.learners.clear()
         for context, data in state["learners"].items():
             if tuple(state["actions"]) == self.actions:
-                self.learner(context).take_plain(data)
+                self._kept(context).take_plain(data)
             else:
                 self._take_moved(context, list(state["actions"]), data)
 
     def _take_moved(self, context: str, actions: list[str], data: Mapping[str, Any]) -> None:
         """A state over other actions: sums go with their actions; a new action gets an equal share, the rest is scaled."""
-        batch, old = self.learner(context), self.rule.begin(1, len(actions), self.question.rho)
-        old.own["admitted"] = np.zeros((1, len(actions)))
+        batch, old = self._kept(context), self._fresh(actions)
         old.take_plain(data)
         pairs = [(i, actions.index(a)) for i, a in enumerate(self.actions) if a in actions]
         kept = sum(old.p[0, j] for _, j in pairs)

@@ -188,3 +188,17 @@ def test_firings_are_counted(task: Task) -> None:
     passages = [r for r in selector.records if isinstance(r, Passage)]
     assert len(passages) == mission.tally.firings
     assert {p.transition for p in passages if p.waited is not None} == {"begin"}
+
+
+def test_people_are_shown_what_was_learned(task: Task) -> None:
+    """Probability of each alternative, and R, C and J of those that ran; asking for it teaches nothing."""
+    selector = learner(task, seed=1)
+    assert selector.figures("pick")["pick_slow"] == {"probability": 0.0}
+    assert not selector.learning.state()["pick"]["learners"]
+    run(task, selector, runs=20)
+    shown = selector.figures("pick")
+    assert sum(a["probability"] for a in shown.values()) == pytest.approx(1.0)
+    assert shown["pick_slow"]["reliability"] == 1.0
+    assert shown["pick_blind"]["j"] > shown["pick_slow"]["j"] > 0
+    assert shown["pick_slow"]["cost"] == pytest.approx(0.35, abs=0.06)
+    assert selector.figures("nothing of the kind") == {}

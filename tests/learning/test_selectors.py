@@ -122,6 +122,8 @@ def test_probabilities_are_probabilities_whatever_happens(name: str, ends: list[
 def test_choosing_changes_nothing(name: str) -> None:
     """So that a resumed run, which is not asked again, comes to the same state."""
     selector = taught(make(name, ACTIONS), good=3)
+    selector.choose("never seen", ACTIONS, np.random.default_rng(7))
+    assert "never seen" not in selector.state()["learners"]
     before = json.dumps(selector.state())
     drawn_first = selector.choose("", ACTIONS, np.random.default_rng(7))
     assert json.dumps(selector.state()) == before

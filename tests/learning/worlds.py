@@ -61,6 +61,8 @@ class Played:
     """Share of the last hundred choices that were optimal, by row."""
     p_best: Array
     """p of the optimum at each checkpoint, shape (checkpoints, rows)."""
+    recent: Array
+    """Share of the hundred choices before each checkpoint that were optimal, shape (checkpoints, rows)."""
     checkpoints: Sequence[int]
 
 
@@ -77,7 +79,7 @@ def play(
     batch, n = rule.begin(seeds, world.n), world.n
     offered = np.ones((seeds, n), dtype=bool)
     marks = list(checkpoints) or [trials]
-    total, regret, p_best = np.zeros(seeds), [], []
+    total, regret, p_best, shares = np.zeros(seeds), [], [], []
     recent = np.zeros((100, seeds))
     executed = np.ones(seeds, dtype=bool)
     for t in range(trials):
@@ -95,5 +97,6 @@ def play(
         if t + 1 in marks:
             regret.append(total.copy())
             p_best.append(batch.p[:, j <= j.min() + 1e-12].sum(axis=1))
+            shares.append(recent[: t + 1].mean(axis=0))
     optimal = recent[: min(trials, 100)].mean(axis=0)
-    return Played(batch, np.array(regret), optimal, np.array(p_best), marks)
+    return Played(batch, np.array(regret), optimal, np.array(p_best), np.array(shares), marks)
