@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 Box = tuple[slice, slice]
+Disc = tuple[float, float, float]
+"""Pixel (u, v) of its middle, and its radius (px)."""
 
 ARM_GREY = 120.0
 CUP_GREY = 92.0
@@ -81,12 +83,28 @@ class Occluders:
         if key != self._seen[0]:
             if len(points) != len(radii):
                 raise ValueError(f"{len(points)} capsules of the arm, but {len(radii)} radii")
-            arm = [self._capsule(a, b, r) for (a, b), r in zip(points.tolist(), radii.tolist(), strict=True)]
-            self._seen = key, [cover for cover in arm if cover is not None] + self._cup(pose)
+            self._seen = key, self._arm(points.tolist(), radii.tolist()) + self._cup(pose)
         return self._seen[1]
 
-    def _capsule(self, a: Sequence[float], b: Sequence[float], radius: float) -> Cover | None:
-        """The hull of both ends' discs, None if it is not in view."""
+    def _arm(self, capsules: Sequence[Sequence[Sequence[float]]], radii: Sequence[float]) -> list[Cover]:
+        """The hull of both ends' discs for each capsule in view."""
+        seen = [
+            (disc, 0.5 * (a[2] + b[2]))
+            for (a, b), r in zip(capsules, radii, strict=True)
+            if (disc := self._discs(a, b, r))
+        ]
+        if not seen:
+            return []
+        discs = np.array([disc for disc, _ in seen])
+        rims = (discs[:, :, None, 2:] * CIRCLE + discs[:, :, None, :2]).reshape(len(seen), -1, 2)
+        corners = np.rint(rims * _SUBPIXELS).astype(np.int32)
+        return [
+            self._cover(hull, 0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1]), ARM_GREY, height)
+            for hull, ((a, b), height) in zip(corners, seen, strict=True)
+        ]
+
+    def _discs(self, a: Sequence[float], b: Sequence[float], radius: float) -> tuple[Disc, Disc] | None:
+        """Both ends of a capsule, None if it is not in view."""
         lens = self._lens
         (ua, va, near), (ub, vb, far) = lens.pixel(a), lens.pixel(b)
         if near <= 4.0 * radius or far <= 4.0 * radius:
@@ -96,8 +114,7 @@ class Occluders:
             min(ua - ra, ub - rb), min(va - ra, vb - rb), max(ua + ra, ub + rb), max(va + ra, vb + rb)
         ):
             return None
-        rims = np.concatenate([ra * CIRCLE + (ua, va), rb * CIRCLE + (ub, vb)])
-        return self._cover(rims, ARM_GREY, 0.5 * (a[2] + b[2]))
+        return (ua, va, ra), (ub, vb, rb)
 
     def _cup(self, pose: Array | None) -> list[Cover]:
         """The wall as the hull of both rims, then the dark mouth as far as it faces the camera."""
@@ -114,21 +131,24 @@ class Occluders:
         wall = pixels[:count]
         if not self._in_view(*wall.min(axis=0).tolist(), *wall.max(axis=0).tolist()):
             return []
-        covers = [self._cover(wall, CUP_GREY, mouth[2], cup=True)]
+        corners = np.rint(pixels * _SUBPIXELS).astype(np.int32)
+        at_u, at_v = wall.mean(axis=0).tolist()
+        covers = [self._cover(corners[:count], at_u, at_v, CUP_GREY, mouth[2], cup=True)]
         if (lens.position - pose[:3, 3]) @ pose[:3, 2] > 0.0:
-            covers.append(self._cover(pixels[count:], CUP_INSIDE_GREY, mouth[2], cup=True))
+            covers.append(self._cover(corners[count:], u, v, CUP_INSIDE_GREY, mouth[2], cup=True))
         return covers
 
     def _in_view(self, left: float, top: float, right: float, bottom: float) -> bool:
         """Whether some of a box (px) is in the image."""
         return right >= 0.0 and bottom >= 0.0 and left < self._lens.width and top < self._lens.height
 
-    def _cover(self, pixels: Array, grey: float, height: float, cup: bool = False) -> Cover:
-        """The convex hull of pixels in its middle's light."""
+    def _cover(
+        self, corners: NDArray[np.int32], u: float, v: float, grey: float, height: float, cup: bool = False
+    ) -> Cover:
+        """The convex hull of corners (n, 2), in sixteenths of a pixel, in the light of the pixel (u, v)."""
         lens = self._lens
-        u, v = (pixels.sum(axis=0) / len(pixels)).tolist()
         light = lens.illumination[min(max(int(v), 0), lens.height - 1), min(max(int(u), 0), lens.width - 1)]
-        hull = np.asarray(cv2.convexHull(np.rint(pixels * _SUBPIXELS).astype(np.int32)), np.int32)
+        hull = np.asarray(cv2.convexHull(corners), np.int32)
         left, top, wide, high = cv2.boundingRect(hull)
         box = _within(lens.height, top, top + high), _within(lens.width, left, left + wide)
         return Cover(hull, box, grey * float(light), height, cup)
