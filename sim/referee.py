@@ -35,6 +35,7 @@ PLOTS: Final = {
         "kind": "histogram",
         "title": "How far from the middle of the cup's mouth each ball came",
         "x": "throws.miss_mm",
+        "least": 0.0,
         "most": 150.0,
         "x_label": "distance (mm), up to 150",
         "colour": "throws.outcome",

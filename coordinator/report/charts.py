@@ -283,10 +283,12 @@ def points(
     return chart.svg()
 
 
-def histogram(title: str, x_label: str, groups: Mapping[str, Sequence[float]], bins: int = 30) -> str:
-    """Counts of values in classes of equal width, groups stacked."""
+def histogram(
+    title: str, x_label: str, groups: Mapping[str, Sequence[float]], bins: int = 30, *, least: float | None = None
+) -> str:
+    """Counts of values in classes of equal width, groups stacked; the first class begins at `least` if that is given."""
     every = [v for group in groups.values() for v in group]
-    low, high = limits(every, room=0.0)
+    low, high = limits(every if least is None else [least, *every], room=0.0)
     high = high if high > low else low + 1.0
     step = (high - low) / bins
     counts = {name: _counts(group, low, step, bins) for name, group in groups.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from base64 import b64encode
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
@@ -26,6 +27,7 @@ th{color:var(--soft);font-weight:600;font-size:.85rem}
 .picture{overflow-x:auto;background:var(--panel);border-radius:8px;padding:.75rem}.picture svg{max-width:100%;height:auto}
 .gallery{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,500px),1fr));gap:.75rem}
 h3{margin:1.2rem 0 .3rem;font-size:1rem}h3 small{color:var(--soft);font-weight:400}
+.wide{overflow-x:auto}
 details summary{cursor:pointer;color:var(--soft)}
 """
 
@@ -62,7 +64,15 @@ def standalone(svg: str) -> str:
 
 def gallery(pictures: Iterable[str]) -> str:
     """Pictures side by side as far as there is room."""
-    return f'<div class="gallery">{"".join(picture(svg) for svg in pictures)}</div>'
+    framed = "".join(picture(svg) for svg in pictures)
+    return f'<div class="gallery">{framed}</div>' if framed else ""
+
+
+def apart(svg: str, alternative: str) -> str:
+    """A picture that brings a style of its own, so framed that it leaves the rest of the page alone."""
+    data = b64encode(svg.encode("utf-8")).decode("ascii")
+    image = f'<img src="data:image/svg+xml;base64,{data}" alt="{escape(alternative)}" style="max-width:100%">'
+    return f'<div class="picture">{image}</div>'
 
 
 def picture(svg: str) -> str:
@@ -90,7 +100,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     columns = list(dict.fromkeys(key for row in rows for key in row))
     head = "".join(f"<th>{escape(column)}</th>" for column in columns)
     body = "".join(f"<tr>{''.join(f'<td>{cell(c, row.get(c))}</td>' for c in columns)}</tr>" for row in rows)
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def cell(column: str, value: Any) -> str:

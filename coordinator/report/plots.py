@@ -3,7 +3,8 @@
     plots = { catch_map = { kind = "lines", title = "...", x = "table.column", y = "...", x2 = "...", y2 = "...",
                             x_label = "... (m)", y_label = "... (m)", colour = "table.column" } }
 
-kind: `points` (x, y), `lines` (to x2, y2) or `histogram` (x). `pictures` in a score holds finished SVG texts by title.
+kind: `points` (x, y), `lines` (to x2, y2) or `histogram` (x; between `least` and `most`, if given). `pictures` in a
+score holds finished SVG texts by title.
 """
 
 from __future__ import annotations
@@ -53,7 +54,10 @@ def _histogram(plot: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> st
             groups.setdefault(_group(plot, row), []).append(value)
     if not groups:
         return None
-    return charts.histogram(str(plot.get("title", "")), str(plot.get("x_label", plot["x"])), _sorted(groups))
+    least = float(plot["least"]) if "least" in plot else None
+    return charts.histogram(
+        str(plot.get("title", "")), str(plot.get("x_label", plot["x"])), _sorted(groups), least=least
+    )
 
 
 def _group(plot: Mapping[str, Any], row: Mapping[str, Any]) -> str:

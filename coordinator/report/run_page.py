@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from html import escape
 from typing import Any
 
-from coordinator.report.page import html_page, is_table, numbers, picture, section, status, table
+from coordinator.report.page import apart, gallery, html_page, is_table, numbers, picture, section, status, table
 from coordinator.report.plots import declared, finished
 from coordinator.task import Status
 from coordinator.timeline import Bar, Timeline
@@ -27,10 +27,10 @@ def report_html(
         f"<h1>{escape(str(result.get('task', 'task')))}</h1>",
         f'<p class="lead">{status(result.get("status"))} {escape(str(result.get("reason", "")))}</p>',
         numbers(result),
-        *(section(name, picture(svg)) for name, svg in {**own_pictures(result), **(pictures or {})}.items()),
+        section("Of the task itself", gallery([*own_pictures(result).values(), *(pictures or {}).values()])),
         section("Runs over time", picture(gantt_svg(timeline))),
         *(section(key.capitalize(), table(rows)) for key, rows in result.items() if is_table(rows)),
-        section("The net", picture(net_svg) if net_svg else ""),
+        section("The net", apart(net_svg, "the net") if net_svg else ""),
         section("What went wrong", _faults(timeline)),
         section("Firings", _firings(timeline)),
     ]

@@ -240,3 +240,39 @@ def test_combinations_by_hand() -> None:
     assert [best.objective, other.objective] == pytest.approx([1.0, 1.0])
     assert (best.goal, other.goal, best.throws) == (0.5, 1.0, 20)
     assert other.task_objective == pytest.approx(0.0 + 2.0 / 1.5)
+
+
+def test_report_of_a_recorded_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """From the journal alone, with the task's own pictures once there is a result."""
+    from coordinator.journal import JournalWriter
+    from coordinator.launch import Setting, lockstep_party, make_mission, with_runs
+    from coordinator.lockstep_party import CoordinatorParty
+    from coordinator.recording import JournalStore
+    from coordinator.runfolder import JOURNAL, RESULT, header
+    from services.comm.cell import Cell
+    from services.comm.directory import load as load_directory
+
+    monkeypatch.syspath_prepend(str(HERE))
+    directory, parameters = load_directory(SERVICES), {**TOY.parameters, "regime": "rough"}
+    given = {"services_path": str(SERVICES), "seed": 3, "runs": 8, "parameters": parameters}
+    texts = (TASK.read_text(encoding="utf-8"), SERVICES.read_text(encoding="utf-8"))
+    folder = tmp_path / "fetch-1"
+    store = JournalStore(JournalWriter(folder / JOURNAL, header("fetch-1", *texts, "lockstep", given)), 0.0)
+    mission = make_mission(directory, Setting(with_runs(TOY, 8)[0], parameters, 8, 3), "fetch-1", "boot", store)
+    party = CoordinatorParty(directory, mission)
+    assert Cell([party, *(lockstep_party(directory, node) for node in directory.nodes.values())]).run(
+        lambda: party.over, 100_000
+    )
+    store.sync()
+    assert main(["report", str(folder)]) == 0
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    failed = [run for run in mission.tally.runs if run.status is not None and run.status != "success"]
+    assert failed and all(run.cause in page for run in failed)
+    assert page.count("<rect x=") >= len(mission.tally.runs)
+    (folder / RESULT).write_text(json.dumps(mission.result("lockstep", 1.0)), encoding="utf-8")
+    assert main(["report", str(folder), "--out", str(tmp_path / "again.html")]) == 0
+    assert "Where parts lay" in (tmp_path / "again.html").read_text(encoding="utf-8")
+    assert {p.stem for p in (tmp_path / "again_pictures").glob("*.svg")} == {"gantt", "own_1"}
+    capsys.readouterr()
