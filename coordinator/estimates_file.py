@@ -106,11 +106,12 @@ class EstimatesFile:
         gained: Estimates,
         selectors: Mapping[str, Mapping[str, Any]],
         mission: str = "",
-        records: int = 0,
+        records: int | None = None,
     ) -> None:
         """Add what a session gained to this file's own origin, and keep its selectors' states (primitive task -> state).
 
-        `mission`, `records`: remember that so many records of a mission run are counted, so that none counts twice.
+        `mission`, `records`: remember that so many records of a mission run are counted, so that none counts twice when it is
+        resumed (None: it has ended, nothing need be remembered).
         """
         with self._writing() as db:
             origin = _about(db, "origin")
@@ -121,8 +122,9 @@ class EstimatesFile:
             for task, state in selectors.items():
                 _put_selector(db, task, state)
             db.execute("UPDATE about SET value = CAST(value AS INTEGER) + 1 WHERE name = 'generation'")
-            if mission:
-                db.execute("INSERT OR REPLACE INTO mission VALUES (?, ?)", (mission, records))
+            db.execute("DELETE FROM mission WHERE id = ?", (mission,))
+            if records is not None:
+                db.execute("INSERT INTO mission VALUES (?, ?)", (mission, records))
 
     def put_selectors(self, selectors: Mapping[str, Mapping[str, Any]]) -> None:
         """Replace selectors' states (freezing, overriding by hand)."""

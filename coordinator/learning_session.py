@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -66,6 +67,7 @@ class LearningSession:
         generation = kept.generation if begun is None else int(begun["generation"])
         self.learning = _learning(task, setting, kept, None if begun is None else begun["selectors"])
         self._generation = generation
+        self._token = secrets.token_hex(8) if begun is None else str(begun["token"])
         self._begun = self.learning.state()
         self.selector = LearningSelector(
             self.learning, contexts, setting.chosen, seed=seed, generation=generation, live=not setting.frozen
@@ -73,18 +75,20 @@ class LearningSession:
 
     def beginning(self) -> dict[str, Any]:
         """Plain data from which a resumed run derives the same choices again."""
-        return {**self.setting.to_plain(), "generation": self._generation, "selectors": self._begun}
+        begun = {"token": self._token, "generation": self._generation, "selectors": self._begun}
+        return {**self.setting.to_plain(), **begun}
 
-    def save(self, mission: str = "") -> int:
+    def save(self, *, interrupted: bool = False) -> int:
         """Add what was learned to the file; gives the number of runs that were counted.
 
-        `mission`: the id of a mission run that may be resumed; what was saved of it before is not counted again.
+        `interrupted`: the mission run may be resumed; what is saved of it now will not be counted again then.
         """
         if self.setting.frozen:
             return 0
-        done = self.file.records_of(mission) if mission else 0
+        done = self.file.records_of(self._token)
         gained = self.learning.gained if not done else self._gained_after(done)
-        self.file.add(gained, self.learning.state(), mission, len(self.selector.records))
+        counted = len(self.selector.records) if interrupted else None
+        self.file.add(gained, self.learning.state(), self._token, counted)
         return sum(t.runs + t.censored for t in gained.tallies.values())
 
     def _gained_after(self, done: int) -> Estimates:

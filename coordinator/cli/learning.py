@@ -86,21 +86,24 @@ def opened(task: Task, chosen: Mapping[str, str], options: argparse.Namespace) -
 
 
 @contextmanager
-def saved(session: LearningSession | None, mission: str = "") -> Iterator[dict[str, Any]]:
+def saved(session: LearningSession | None) -> Iterator[dict[str, Any]]:
     """Save what a mission run learned, also when it is interrupted; what is yielded then holds what the result says of it."""
     told: dict[str, Any] = {}
     try:
         yield told
-    finally:
+    except BaseException:
         if session is not None:
-            told["learned"] = _save(session, mission)
+            _save(session, interrupted=True)
+        raise
+    if session is not None:
+        told["learned"] = _save(session, interrupted=False)
 
 
-def _save(session: LearningSession, mission: str) -> dict[str, Any]:
+def _save(session: LearningSession, *, interrupted: bool) -> dict[str, Any]:
     from coordinator.estimates_file import EstimatesError
 
     try:
-        runs = session.save(mission)
+        runs = session.save(interrupted=interrupted)
     except EstimatesError as fault:
         raise CommandError(2, str(fault)) from fault
     learning, values = session.learning, session.selector.context

@@ -68,7 +68,7 @@ def _resume_lockstep(found: Recorded, options: argparse.Namespace) -> tuple[Miss
     from coordinator.cli.run import progress
 
     selector, session = resumed_selector(found.task, found.journal.header)
-    with saved(session, found.journal.header["mission"]) as learned, progress(options) as watch:
+    with saved(session) as learned, progress(options) as watch:
         if found.journal.header["cell"] == JOINED:
             mission, timeline = rejoin(found, selector, [] if session is None else [session.selector], watch)
         else:
@@ -88,6 +88,6 @@ async def _resume(found: Recorded, options: argparse.Namespace) -> tuple[Mission
     observers: list[Observer] = [timeline] if session is None else [timeline, session.selector]
     mission, go_on = resumed_mission(found.directory, found.task, found.engine, found.journal, observers, now, selector)
     options.folder = found.journal.path.parent
-    with saved(session, found.journal.header["mission"]) as learned:
+    with saved(session) as learned:
         await drive(found.directory, mission, options, go_on)
     return mission, timeline, learned

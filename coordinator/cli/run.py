@@ -93,7 +93,7 @@ def run(options: argparse.Namespace) -> int:
                 mission, timeline = _run_lockstep(directory, setting, options)
         else:
             options.identity = mission_id(task)
-            with saved(options.learning, options.identity) as learned:
+            with saved(options.learning) as learned:
                 mission, timeline = asyncio.run(_run_realtime(directory, setting, options))
     except MissionError as fault:
         raise CommandError(2 if fault.bad_input else 1, str(fault)) from fault

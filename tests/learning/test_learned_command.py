@@ -9,9 +9,13 @@ from typing import Any
 import pytest
 
 from coordinator.cli import main
+from coordinator.engine import Engine
 from coordinator.estimates_file import EstimatesFile
+from coordinator.journal import JournalWriter, read_journal
+from coordinator.launch import resumed_mission, with_runs
 from coordinator.learning.estimate import Key
 from coordinator.learning_session import LearningSession, LearningSetting, session_of
+from coordinator.recording import JournalStore
 from tests.learning.cell import TASK_FILE, directory, run, sorting
 
 SERVICES = """
@@ -181,13 +185,13 @@ def test_a_run_that_was_saved_and_resumed_counts_once(tmp_path: Path) -> None:
     for record in one.selector.records[:half]:
         interrupted.selector.records.append(record)
         interrupted.learning.apply(record)
-    interrupted.save("m")
+    interrupted.save(interrupted=True)
     resumed = session_of(task, header)
     assert resumed is not None
     for record in one.selector.records:
         resumed.selector.records.append(record)
         resumed.learning.apply(record)
-    resumed.save("m")
+    resumed.save()
     kept = EstimatesFile(path).read()
     for key, tally in one.learning.gained.tallies.items():
         assert kept.estimates.tally(key).counts == tally.counts
@@ -195,3 +199,38 @@ def test_a_run_that_was_saved_and_resumed_counts_once(tmp_path: Path) -> None:
     assert directory(task).actions
     assert session_of(task, {"seed": 5}) is None
     assert Key("pick", "pick_slow", "regime=A") in kept.estimates.tallies
+
+
+def test_a_resumed_mission_brings_its_selector_to_where_it_was(tmp_path: Path) -> None:
+    """A journal that stops half way: what the resumed selector knows is what the live one knew there, and its next choice is
+    the same."""
+    task, path = sorting(), tmp_path / "learned.db"
+    session = LearningSession(task, LearningSetting(path), seed=5)
+    header = {
+        "mission": "sorting/5",
+        "mode": "lockstep",
+        "seed": 5,
+        "runs": 9,
+        "parameters": task.parameters,
+        "learning": session.beginning(),
+    }
+    store = JournalStore(JournalWriter(tmp_path / "run.journal", header), 0.0)
+    run(task, session.selector, runs=9, seed=5, store=store)
+    store.sync()
+    whole = (tmp_path / "run.journal").read_bytes()
+    (tmp_path / "half.journal").write_bytes(whole[: len(whole) // 2])
+    journal = read_journal(tmp_path / "half.journal")
+    known, _ = with_runs(task, 9)
+    resumed = session_of(task, json.loads(json.dumps(journal.header)))
+    assert resumed is not None
+    mission, _ = resumed_mission(
+        directory(task), known, Engine(known, {}), journal, [resumed.selector], 100.0, resumed.selector
+    )
+    n = len(resumed.selector.records)
+    assert 0 < n < len(session.selector.records)
+    assert resumed.selector.records == session.selector.records[:n]
+    again = LearningSession(task, LearningSetting(path), seed=5)
+    for record in session.selector.records[:n]:
+        again.learning.apply(record)
+    assert resumed.learning.state() == again.learning.state()
+    assert mission.executor.selector is resumed.selector
