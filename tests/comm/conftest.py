@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import AsyncIterator, Callable, Iterable
 from typing import Any, get_args
 
 import pytest
 from hypothesis import strategies as st
 
 from services.comm.codec import LIMITS
+from services.comm.link import Limits
 from services.comm.messages import Executed, Hello, Message, Tick, Welcome
 from services.comm.wire import Connection, Side
+
+from .ends import Node
 
 KEY = bytes(range(32))
 NONCES = {Side.CLIENT: b"c" * 32, Side.SERVER: b"s" * 32}
@@ -114,3 +117,21 @@ def key(request: pytest.FixtureRequest) -> bytes | None:
     """Without a key and with one."""
     found: bytes | None = request.param
     return found
+
+
+@pytest.fixture
+async def node(key: bytes | None) -> AsyncIterator[Node]:
+    """A node with a key or without."""
+    one = Node(key=key)
+    await one.server.start("127.0.0.1", 0)
+    yield one
+    await one.server.close()
+
+
+@pytest.fixture
+async def open_node() -> AsyncIterator[Node]:
+    """A node without a key."""
+    one = Node(limits=Limits(connections=8, opening=4, buffer_high=1 << 16, buffer_hard=1 << 20))
+    await one.server.start("127.0.0.1", 0)
+    yield one
+    await one.server.close()

@@ -1,0 +1,119 @@
+"""Both ends on real sockets, as the tests of server and client make and watch them."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from services.comm import messages as m
+from services.comm.callee import Callee, Offer, Order
+from services.comm.caller import Caller, Notice
+from services.comm.client import Client
+from services.comm.codec import encode
+from services.comm.link import Link, Timing
+from services.comm.server import Server
+
+QUICK = Timing(heartbeat=0.05, silence=0.2, handshake=0.3, backoff=(0.01, 0.05))
+HELLO = m.Hello(1, 1, "coordinator", "coord", "c1", 1)
+
+
+def _echo(now: float, call: m.Call) -> m.Outcome:
+    return m.Outcome(call.id, "success", call.arguments)
+
+
+def _callee(name: str = "motion") -> Callee:
+    offers = {
+        "echo": Offer(inline=_echo),
+        "big": Offer(inline=lambda now, call: m.Outcome(call.id, "success", {"b": bytes(17 << 20)})),
+        "move": Offer(device="arm", orphan_time=0.1),
+    }
+    return Callee(name, "n1", offers)
+
+
+class Node:
+    """A server and what it was ordered to do."""
+
+    def __init__(self, **options: Any) -> None:
+        self.orders: list[Order] = []
+        self.server = Server(_callee(), on_orders=self._take, **{"timing": QUICK, **options})
+        self.ordered = asyncio.Event()
+
+    def _take(self, now: float, orders: list[Order]) -> None:
+        self.orders += orders
+        self.ordered.set()
+
+    async def order(self, kind: type[Any]) -> Any:
+        """The next order of this kind."""
+        async with asyncio.timeout(5.0):
+            while not any(isinstance(order, kind) for order in self.orders):
+                self.ordered.clear()
+                await self.ordered.wait()
+        return next(order for order in self.orders if isinstance(order, kind))
+
+    def client(self, hello: m.Hello = HELLO, **options: Any) -> Coordinator:
+        return Coordinator(*self.server.address, hello, **options)
+
+
+class Coordinator:
+    """A client and what it was told."""
+
+    def __init__(self, host: str, port: int, hello: m.Hello = HELLO, **options: Any) -> None:
+        self.notices: list[Notice] = []
+        self.told = asyncio.Event()
+        self.caller = Caller("motion", hello)
+        self.client = Client(host, port, self.caller, on_notices=self._take, **{"timing": QUICK, **options})
+        self.client.start()
+
+    def _take(self, now: float, notices: list[Notice]) -> None:
+        self.notices += notices
+        self.told.set()
+
+    async def notice(self, kind: type[Any], number: int = 1) -> Any:
+        """The so-manieth notice of this kind."""
+        async with asyncio.timeout(5.0):
+            while len(found := [notice for notice in self.notices if isinstance(notice, kind)]) < number:
+                self.told.clear()
+                await self.told.wait()
+        return found[number - 1]
+
+    def call(self, id_: str, service: str, **arguments: Any) -> None:
+        self.caller.call(self.client.now(), m.Call(id_, service, arguments))
+        self.client.flush()
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    """Wait until it holds: looked at again whenever a server, a client or a heart has done something."""
+    stirred = asyncio.Event()
+    with pytest.MonkeyPatch.context() as patch:
+        for owner, name in ((Server, "arm"), (Server, "gone"), (Client, "flush"), (Link, "_beat")):
+            patch.setattr(owner, name, _and_then(getattr(owner, name), stirred.set))
+        async with asyncio.timeout(5.0):
+            while not condition():
+                stirred.clear()
+                await stirred.wait()
+
+
+def _and_then(method: Callable[..., Any], do: Callable[[], None]) -> Callable[..., Any]:
+    def both(*arguments: Any) -> Any:
+        result = method(*arguments)
+        do()
+        return result
+
+    return both
+
+
+def frame(message: m.Message) -> bytes:
+    """A message as it goes over the wire without a key."""
+    body = encode(message)
+    return len(body).to_bytes(4, "big") + body
+
+
+async def read_all(reader: asyncio.StreamReader) -> bytes:
+    """All until the other end hangs up."""
+    with contextlib.suppress(ConnectionError):
+        return await reader.read()
+    return b""

@@ -1,0 +1,30 @@
+"""The heart of a link by itself: when it beats, and when it gives the other side up."""
+
+from __future__ import annotations
+
+import pytest
+
+from services.comm.link import Beat, Heart, Timing
+
+
+def test_the_heart_pings_then_gives_up() -> None:
+    heart = Heart(0.0, Timing())
+    seen: list[tuple[float, Beat]] = []
+    while not seen or seen[-1][1] is not Beat.LOST:
+        seen.append((heart.due(), heart.advance(heart.due())))
+    assert seen == [(0.25, Beat.PING), (0.5, Beat.PING), (0.75, Beat.PING), (1.0, Beat.LOST)]
+
+
+def test_what_is_heard_puts_the_end_off() -> None:
+    heart = Heart(0.0, Timing())
+    for tick in range(1, 40):
+        heart.heard = tick * 0.25 - 0.1
+        assert heart.advance(heart.due()) is Beat.NOTHING
+    assert heart.due() == pytest.approx(10.0)
+
+
+def test_a_process_that_stood_still_itself_listens_before_it_blames_the_other() -> None:
+    heart = Heart(0.0, Timing())
+    assert heart.advance(5.0) is Beat.PING
+    assert heart.due() == pytest.approx(5.25)
+    assert heart.advance(5.25) is Beat.LOST
