@@ -236,6 +236,19 @@ def test_a_run_given_up_in_an_earlier_life_is_stopped_its_fence_outlives_the_coo
     assert bench.calls() == [TIDY]
 
 
+def test_a_latched_event_that_came_while_nobody_coordinated_is_delivered_once() -> None:
+    """Its source keeps it until it is acknowledged; one that an earlier life took already is not taken again."""
+    first = Bench().begin()
+    bench = first.resumed(2.0, runs=[WORK])
+    bench.ring(2.1, number=1)
+    bench.say(2.1, m.Event("bell", "desk", 1))
+    assert bench.fired == ["rung"]
+    again = bench.resumed(3.0, runs=[WORK])
+    assert isinstance(again.executor.state.seen, dict) and again.executor.state.seen == {"desk": 1}
+    again.ring(3.1, number=1)
+    assert again.fired == []
+
+
 def test_a_cancelled_run_is_cancelled_again_and_waited_for() -> None:
     first = Bench().begin()
     first.ring(1.0)

@@ -1,0 +1,100 @@
+"""kill -9 of the coordinator over real processes: `petrobot resume` goes on where it was, and no action is executed twice."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.chaos.shuttle_cell import ROOT, TASK, moves, shuttle_services
+
+pytestmark = pytest.mark.processes
+RUNS = 8
+MANY = 150
+"""In lock step, where they pass quickly."""
+PATIENCE = 120.0
+QUIET = ("--quiet", "--no-page")
+
+
+def petrobot(folder: Path, *arguments: str) -> subprocess.Popen[bytes]:
+    """A command of ours that runs; what it prints goes to a file."""
+    with (folder / f"{arguments[0]}.txt").open("ab") as out:
+        return subprocess.Popen([sys.executable, "-m", "coordinator", *arguments], cwd=ROOT, stdout=out, stderr=out)
+
+
+def until(ready: Callable[[], Any], process: subprocess.Popen[bytes] | None = None) -> None:
+    """Wait for a condition."""
+    deadline, pause = time.monotonic() + PATIENCE, threading.Event()
+    while not ready():
+        assert process is None or process.poll() is None, f"it ended: {process and process.returncode}"
+        assert time.monotonic() < deadline, "it takes too long"
+        pause.wait(0.002)
+
+
+def nodes(folder: Path, *options: str) -> subprocess.Popen[bytes]:
+    """`petrobot up`, ready."""
+    services = str(folder / "services.toml")
+    up = petrobot(folder, "up", "--services", services, "--logs", str(folder / "logs"), *options)
+    until(lambda: b"Ctrl-C" in (folder / "up.txt").read_bytes(), up)
+    return up
+
+
+def killed_and_resumed(folder: Path, count: int, kills: list[int], first: list[str]) -> dict[str, Any]:
+    """`count` runs whose coordinator is killed when so many moves have begun, and resumed each time. The result."""
+    runs = folder / "runs"
+    process = petrobot(folder, "run", str(TASK), "--runs", str(count), "--journal", str(runs), *first)
+    for begun in kills:
+        until(lambda begun=begun: len(moves(folder, "begin")) >= begun, process)  # type: ignore[misc]
+        process.send_signal(signal.SIGKILL)
+        assert process.wait() == -signal.SIGKILL
+        [run] = runs.iterdir()
+        process = petrobot(folder, "resume", str(run), "--json", str(folder / "out.json"), *QUIET)
+    said = (folder / "resume.txt").read_text
+    assert process.wait(PATIENCE) == 0, said()
+    replay = petrobot(folder, "replay", str(run), "--json", str(folder / "replay.json"))
+    assert replay.wait(PATIENCE) == 0, (folder / "replay.txt").read_text()
+    result: dict[str, Any] = json.loads((folder / "out.json").read_text())
+    return result
+
+
+def test_a_run_in_real_time_killed_twice_goes_on_where_it_was(tmp_path: Path) -> None:
+    """Runs that went on are rejoined, results that came meanwhile are fetched: every move is made once and none is lost."""
+    shuttle_services(tmp_path, fetch=0.4, carry=0.5, orphan=60.0)
+    up = nodes(tmp_path)
+    try:
+        first = ["--services", str(tmp_path / "services.toml"), *QUIET]
+        result = killed_and_resumed(tmp_path, RUNS, [2, 6], first)
+    finally:
+        up.terminate()
+        assert up.wait(PATIENCE) == 0
+    assert (result["status"], result["mode"], result["runs"]) == ("success", "realtime", RUNS)
+    begun, ended = moves(tmp_path, "begin"), moves(tmp_path, "end")
+    assert set(begun.values()) == {1} and set(ended) <= set(begun) and not moves(tmp_path, "overlap")
+    first_moves = [call for call in begun if "tidy" not in call]
+    assert len(first_moves) == RUNS, "no token lost or doubled"
+    journal = (tmp_path / "resume.txt").read_text()
+    assert "Traceback" not in journal
+
+
+def test_a_run_in_lock_step_whose_nodes_wait_goes_on_where_it_was(tmp_path: Path) -> None:
+    """One process a node: they wait for the resumed coordinator, and simulated time with them."""
+    shuttle_services(tmp_path, fetch=0.4, carry=0.5)
+    up = nodes(tmp_path, "--lockstep")
+    first = ["--services", str(tmp_path / "services.toml"), "--mode", "lockstep", "--processes", "0", "--join", *QUIET]
+    try:
+        result = killed_and_resumed(tmp_path, MANY, [3, 40], first)
+        assert up.wait(PATIENCE) == 0, "members end with their cell"
+    finally:
+        up.terminate()
+        up.wait(PATIENCE)
+    assert (result["status"], result["mode"], result["runs"]) == ("success", "lockstep", MANY)
+    begun = moves(tmp_path, "begin")
+    assert set(begun.values()) == {1} and len([call for call in begun if "tidy" not in call]) == MANY
