@@ -271,21 +271,24 @@ async def test_without_the_page_only_the_protocol_is_served(stage: Stage, tasks:
 async def test_an_oversized_message_ends_its_connection_alone(page: Page, size: int) -> None:
     """It is not even taken in whole; another client goes on."""
     hello = {"type": "hello", "protocol": PROTOCOL, "name": "ana", "tab": "1"}
-    async with aiohttp.ClientSession(headers=bearer(page)) as http:
-        async with http.ws_connect(base(page) + "/api/live") as good, http.ws_connect(base(page) + "/api/live") as bad:
-            for socket in (good, bad):
-                await socket.send_json(hello)
-                assert (await socket.receive_json(timeout=5))["type"] == "snapshot"
-            with contextlib.suppress(ConnectionError):
-                await bad.send_str("x" * size)
-            async with asyncio.timeout(5):
-                while not bad.closed:
-                    await bad.receive()
-            assert bad.close_code in (aiohttp.WSCloseCode.MESSAGE_TOO_BIG, aiohttp.WSCloseCode.ABNORMAL_CLOSURE)
-            await good.send_json({"type": "command", "id": 1, "verb": "take_controls"})
-            async with asyncio.timeout(5):
-                while (await good.receive_json())["type"] != "answer":
-                    pass
+    async with (
+        aiohttp.ClientSession(headers=bearer(page)) as http,
+        http.ws_connect(base(page) + "/api/live") as good,
+        http.ws_connect(base(page) + "/api/live") as bad,
+    ):
+        for socket in (good, bad):
+            await socket.send_json(hello)
+            assert (await socket.receive_json(timeout=5))["type"] == "snapshot"
+        with contextlib.suppress(ConnectionError):
+            await bad.send_str("x" * size)
+        async with asyncio.timeout(5):
+            while not bad.closed:
+                await bad.receive()
+        assert bad.close_code in (aiohttp.WSCloseCode.MESSAGE_TOO_BIG, aiohttp.WSCloseCode.ABNORMAL_CLOSURE)
+        await good.send_json({"type": "command", "id": 1, "verb": "take_controls"})
+        async with asyncio.timeout(5):
+            while (await good.receive_json())["type"] != "answer":
+                pass
 
 
 async def test_clients_are_bounded_and_commands_still_come_in(page: Page) -> None:
