@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sim.track_floor import COARSE, FINE, ORIGIN, Floor, Picture
+from sim.track_floor import COARSE, FINE, Floor, Picture, Window
 
 Array = NDArray[np.float64]
 
@@ -22,7 +22,9 @@ STILL: Final = 0.0005
 """m by which the farthest floor in view moves during an exposure, below which one view of it is enough."""
 _BLUR: Final = 0.5 / math.sqrt(3.0)
 """Two views so much of the exposure before and after its middle spread a point as evenly as the whole exposure (equal variance)."""
-_NOISE_SIZE: Final = 512
+_NOISE_SIZE: Final = 320
+_NOISE_ZERO: Final = 128.0
+"""Grey level of the noise field that stands for none."""
 _SAMPLING: Final = 3.0
 """Cells of the fine picture that a pixel may cover along the view before the coarse one is looked at."""
 
@@ -97,14 +99,17 @@ class FloorCamera:
         self._split = self._split_row()
         u, v = np.meshgrid(np.linspace(-1.0, 1.0, mount.width), np.linspace(-1.0, 1.0, mount.rows))
         lit = 1.0 - 0.5 * vignetting * (u * u + v * v)
-        self._gain = (lit * ((self._white - self._black) / 255.0)).astype(np.float32)
-        self._floor_grey = (lit * self._black).astype(np.float32)
+        self._lit = np.asarray(np.rint(255.0 * lit), np.uint8)
         field = np.random.default_rng(_NOISE_SIZE).standard_normal((_NOISE_SIZE, _NOISE_SIZE))
-        self._noise = (noise * field).astype(np.float32)
-        self._maps = [
-            _scaled(self._to_floor, 0.0, self._split, COARSE),
-            _scaled(self._to_floor, float(self._split), mount.rows - self._split, FINE),
+        self._noise = np.asarray(np.clip(np.rint(_NOISE_ZERO + noise * field), 0, 255), np.uint8)
+        self._parts = [
+            _Part(self._to_floor, 0, self._split, Window(COARSE, self._farthest(0.0))),
+            _Part(self._to_floor, self._split, mount.rows, Window(FINE, self._farthest(float(self._split)))),
         ]
+
+    def _farthest(self, row: float) -> float:
+        """How far from the body's origin the ends of a row look (m)."""
+        return max(float(np.hypot(*self._ground(u, row))) for u in (0.0, float(self.mount.width)))
 
     def _ground(self, u: float, v: float) -> Array:
         x, y, w = self._to_floor @ (u, v, 1.0)
@@ -128,64 +133,46 @@ class FloorCamera:
         grain: float = 1.0,
     ) -> Picture:
         """One image (rows, width). `light`: factor, `veil`: grey levels of stray light, `grain`: factor on the noise."""
-        during = self.exposure * _BLUR
+        black, share = self._black, (self._white - self._black) / 255.0
         if self.exposure * (abs(motion.speed) + abs(motion.turn) * self._reach) < STILL:
-            grey = self._view(floor, motion, 0.0).astype(np.float32)
+            still = self._view(floor, motion, 0.0)
+            grey = cv2.addWeighted(still, share, still, 0.0, black)
         else:
+            during = self.exposure * _BLUR
             before, after = self._view(floor, motion, -during), self._view(floor, motion, during)
-            grey = np.add(before, after, dtype=np.float32)
-            grey *= 0.5
-        return self._develop(grey, rng, light, veil, grain)
+            grey = cv2.addWeighted(before, 0.5 * share, after, 0.5 * share, black)
+        grey = cv2.multiply(grey, self._lit, scale=1.0 / 255.0)
+        row, column = (int(rng.integers(_NOISE_SIZE - size)) for size in (self.mount.rows, self.mount.width))
+        noise = self._noise[row : row + self.mount.rows, column : column + self.mount.width]
+        return np.asarray(cv2.addWeighted(grey, light, noise, grain, veil - grain * _NOISE_ZERO), np.uint8)
 
     def _view(self, floor: Floor, motion: Motion, later: float) -> Picture:
         """The paint that each pixel sees, `later` seconds than `motion`."""
         heading = motion.heading + later * motion.turn
         way = later * motion.speed
         c, s = math.cos(heading), math.sin(heading)
-        x, y = motion.x + way * c - ORIGIN, motion.y + way * s - ORIGIN
-        body = np.array([[c, -s, x], [s, c, y], [0.0, 0.0, 1.0]])
+        x, y = motion.x + way * c, motion.y + way * s
         image = np.empty((self.mount.rows, self.mount.width), np.uint8)
-        parts = ((0, self._split, floor.coarse), (self._split, self.mount.rows, floor.fine))
-        for (top, bottom, picture), scaled in zip(parts, self._maps, strict=True):
-            if bottom > top:
+        for part, picture in zip(self._parts, (floor.coarse, floor.fine), strict=True):
+            if part.bottom > part.top:
+                part.window.look(picture, floor.version, x, y)
+                body = np.array([[c, -s, x - part.window.x], [s, c, y - part.window.y], [0.0, 0.0, 1.0]])
                 cv2.warpPerspective(
-                    picture,
-                    scaled.matrix(body),
-                    (self.mount.width, bottom - top),
-                    dst=image[top:bottom],
+                    part.window.part,
+                    part.cells @ body @ part.to_floor,
+                    (self.mount.width, part.bottom - part.top),
+                    dst=image[part.top : part.bottom],
                     flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
                     borderMode=cv2.BORDER_REPLICATE,
                 )
         return image
 
-    def _develop(
-        self, grey: NDArray[np.float32], rng: np.random.Generator, light: float, veil: float, grain: float
-    ) -> Picture:
-        grey *= self._gain
-        grey += self._floor_grey
-        if light != 1.0:
-            grey *= np.float32(light)
-        row, column = rng.integers(_NOISE_SIZE - self.mount.rows), rng.integers(_NOISE_SIZE - self.mount.width)
-        noise = self._noise[row : row + self.mount.rows, column : column + self.mount.width]
-        grey += noise if grain == 1.0 else noise * np.float32(grain)
-        if veil:
-            grey += np.float32(veil)
-        np.rint(grey, out=grey)
-        return np.clip(grey, 0.0, 255.0, out=grey).astype(np.uint8)
 
+class _Part:
+    """Some rows of the image: their homography to the body frame's floor, and the window of the picture that they look at."""
 
-class _Scaled(NamedTuple):
-    """Homography of some rows of the image to the body frame's floor, and the scale of the picture that is looked at."""
-
-    to_floor: Array
-    cells: Array
-
-    def matrix(self, body: Array) -> Array:
-        """From pixels to cells of the picture, for the rover's pose in it (3, 3), m."""
-        matrix: Array = self.cells @ body @ self.to_floor
-        return matrix
-
-
-def _scaled(to_floor: Array, top: float, rows: int, cell: float) -> _Scaled:
-    shift = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, top], [0.0, 0.0, 1.0]])
-    return _Scaled(to_floor @ shift, np.array([[1.0 / cell, 0.0, -0.5], [0.0, 1.0 / cell, -0.5], [0.0, 0.0, 1.0]]))
+    def __init__(self, to_floor: Array, top: int, bottom: int, window: Window) -> None:
+        self.top, self.bottom, self.window = top, bottom, window
+        self.to_floor: Array = to_floor @ np.array([[1.0, 0.0, 0.0], [0.0, 1.0, float(top)], [0.0, 0.0, 1.0]])
+        cell = window.cell
+        self.cells: Array = np.array([[1.0 / cell, 0.0, -0.5], [0.0, 1.0 / cell, -0.5], [0.0, 0.0, 1.0]])

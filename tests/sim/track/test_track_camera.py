@@ -141,6 +141,32 @@ def test_greys_light_veil_and_noise(floor: Floor) -> None:
     assert 8.0 < grained.std() < 9.5
 
 
+@pytest.mark.parametrize("at", [(4.0, 3.0), (-0.9, 3.0), (16.9, 16.9), (8.0, -0.9)])
+@pytest.mark.parametrize("heading", [0.3, 1.9, -2.2])
+def test_every_pixel_shows_the_floor_that_it_looks_at(floor: Floor, at: tuple[float, float], heading: float) -> None:
+    """Also at the board's rim, and whatever the camera has looked at before: the window on the floor goes along."""
+    eye = camera()
+    take(eye, floor, Motion(5.0, 5.0, 0.0, 0.0, 0.0))
+    image = take(eye, floor, Motion(*at, heading, 0.0, 0.0))
+    u, v = np.meshgrid(np.arange(160.0), np.arange(120.0))
+    x, y, w = np.einsum("ij,jkl->ikl", NOMINAL.to_floor(), np.stack([u, v, np.ones_like(u)]))
+    x, y = x / w, y / w
+    c, s = math.cos(heading), math.sin(heading)
+    truth = TRACK.floor(at[0] + c * x - s * y, at[1] + s * x + c * y)
+    wrong = (image > 120) != (truth == 1)
+    assert wrong.mean() < 0.004  # pixels on edges alone
+    assert not cv2.erode(wrong.astype(np.uint8), np.ones((3, 3), np.uint8)).any()
+
+
+def test_a_newly_painted_floor_is_seen_at_once() -> None:
+    floor, eye, at = Floor(), camera(), Motion(4.2, 3.0, 0.0, 0.0, 0.0)
+    floor.paint(TRACK)
+    before = take(eye, floor, at)
+    floor.paint(Track.of((0, 5), 0, "SSSS"))
+    after = take(eye, floor, at)
+    assert (np.abs(before.astype(int) - after) > 100).mean() > 0.03  # the track is gone
+
+
 def test_the_same_draws_give_the_same_image(floor: Floor) -> None:
     eye, at = camera(noise=3.0), Motion(4.2, 3.0, 0.1, 0.5, 0.2)
     one, same, other = (eye.take(floor, at, np.random.default_rng(seed)) for seed in (5, 5, 6))
