@@ -135,7 +135,7 @@ def _cell(bench: Bench, block: Block, selector: BlockSelector) -> tuple[Mission,
     substitutes = load_object(SCRIPTED)(plan.mock) if plan.mock else None
     try:
         parties = [lockstep_party(directory, node, substitutes) for node in directory.nodes.values()]
-    except (DirectoryError, ValueError, OSError) as fault:
+    except (DirectoryError, ImportError, ValueError, OSError) as fault:
         raise CampaignError(f"{plan.services}: {fault}") from fault
     return lockstep_mission(directory, setting), parties
 

@@ -81,6 +81,7 @@ def run(options: argparse.Namespace) -> int:
     from coordinator.campaign.conduct import Campaign
     from coordinator.campaign.plan import CampaignError, read_manifest
     from coordinator.campaign.progress import ProgressLine
+    from coordinator.campaign.table import write_parquet
 
     shown = ProgressLine(sys.stderr)
     shown.wanted = shown.wanted and not options.quiet
@@ -98,6 +99,7 @@ def run(options: argparse.Namespace) -> int:
         finally:
             shown.close()
         result = campaign.result()
+        write_parquet(folder)
         check = None if options.check is None else _checked(options.check, folder)
     except CampaignError as fault:
         raise CommandError(2, str(fault)) from fault

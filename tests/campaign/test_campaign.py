@@ -192,3 +192,30 @@ def test_what_was_learned_can_be_judged_afresh(conduct: Conduct) -> None:
         for run in row.throw.runs if row.throw else ():
             if run.place in best[row.regime]:
                 assert run.action == best[row.regime][run.place]
+
+
+def test_parquet_where_pyarrow_is_there(conduct: Conduct) -> None:
+    """The same rows and columns as the CSV file; without pyarrow nothing is written."""
+    from coordinator.campaign.table import write_parquet
+
+    campaign = conduct("a")
+    parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
+    written = write_parquet(campaign.folder)
+    assert written is not None
+    table_ = parquet.read_table(written)
+    header = table(campaign.folder).split(b"\n")[0].decode().split(",")
+    assert table_.column_names == header
+    assert table_.column("n").to_pylist() == list(range(1, 13))
+
+
+def test_an_action_that_cannot_be_loaded_is_bad_input(conduct: Conduct, tmp_path: Path) -> None:
+    """Named by the location file, not by a lost worker."""
+    from coordinator.campaign.plan import digest
+    from tests.campaign.conftest import SERVICES, TASK
+
+    other = tmp_path / "services.toml"
+    other.write_text(
+        SERVICES.read_text(encoding="utf-8").replace("toy_actions:prepare", "no_such_module:prepare"), encoding="utf-8"
+    )
+    with pytest.raises(CampaignError, match="no_such_module"):
+        conduct("a", services=str(other), digests={"task": digest(TASK), "services": digest(other)})
