@@ -149,3 +149,19 @@ async def tell(ctx: Context, *, name: str) -> Result:
     ctx.progress(0.5, note="half")
     await ctx.sleep(0.1)
     return success(draw=float(ctx.random("x").random()))
+
+
+def twisted(ctx: Context) -> Result:
+    """Returns what no message can carry."""
+    return success(rows=[{"key": {1: 2}}])
+
+
+def double(ctx: Context, *, numbers: tuple[float, ...]) -> Result:
+    """Returns a tuple, and says so in an event."""
+    ctx.raise_event("doubled", count=len(numbers))
+    return success(numbers=tuple(2.0 * n for n in numbers))
+
+
+def broken(ctx: Context) -> Result:
+    """Fails as programs do."""
+    raise ZeroDivisionError("nothing is divided by nothing")

@@ -1,0 +1,44 @@
+"""A service that is a plain function: what its caller is told, also when the function is no good."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+
+from services.comm.directory import ServiceEntry
+from services.comm.messages import Call, Executed
+from services.inline_service import inline_service
+
+EVENTS: list[tuple[str, str, Mapping[str, Any]]] = []
+
+
+def _call(function: str, **arguments: Any) -> Any:
+    EVENTS.clear()
+    entry = ServiceEntry("it", "here", f"toy_cell.actions:{function}")
+    answer = inline_service(entry, lambda service, name, data: EVENTS.append((service, name, data)))
+    return answer(1.5, Call("c1", "it", arguments))
+
+
+def test_its_values_are_plain_and_its_events_are_told() -> None:
+    outcome = _call("double", numbers=[1.0, 2.0])
+    assert (outcome.status, outcome.values, outcome.executed) == ("success", {"numbers": [2.0, 4.0]}, Executed.YES)
+    assert type(outcome.values["numbers"]) is list, "as its caller would see it over the wire"
+    assert EVENTS == [("it", "doubled", {"count": 2})]
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments", "cause", "executed", "says"),
+    [
+        ("twisted", {}, "bad_result", Executed.YES, "values.rows[0].key: the key 1 is not a str"),
+        ("broken", {}, "exception", Executed.YES, "nothing is divided by nothing"),
+        ("double", {"figures": [1.0]}, "bad_arguments", Executed.NO, "it: "),
+    ],
+)
+def test_a_fault_is_one_error_with_its_reason(
+    function: str, arguments: dict[str, Any], cause: str, executed: Executed, says: str
+) -> None:
+    outcome = _call(function, **arguments)
+    assert (outcome.status, outcome.cause, outcome.executed, outcome.values) == ("error", cause, executed, {})
+    assert says in outcome.text
