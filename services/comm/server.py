@@ -27,6 +27,10 @@ from services.comm.wire import ProtocolError, Side, State
 OnOrders = Callable[[float, list[Order]], None]
 AT_ONCE = 16
 """Answers that share one write: the caller takes them in while the next ones are made."""
+BACKLOG = 128
+"""Connections that may wait to be accepted, and"""
+ACCEPTED = 16
+"""how many are accepted in one turn of the loop: a crowd at the door must not keep those inside waiting."""
 COUNTED = 256
 """Messages of a caller after which its rate is looked at."""
 
@@ -184,7 +188,11 @@ class Server:
         require_key(self.callee.name, host, self.key or self.tls is not None)
         self._loop = asyncio.get_running_loop()
         if self.tls is None:
-            self._server = await self._loop.create_server(lambda: _ServerLink(self), host, port, backlog=128)
+            server = await self._loop.create_server(lambda: _ServerLink(self), host, port, backlog=ACCEPTED)
+            for sock in server.sockets:
+                with sock.dup() as own:
+                    own.listen(BACKLOG)  # asyncio takes as many in one turn as it lets wait: of that we want less
+            self._server = server
         else:
             listener = TlsListener(host, port, self.tls, self.timing.handshake, self.limits.opening)
             self._server = listener
