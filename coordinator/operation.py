@@ -20,7 +20,6 @@ from coordinator.engine import (
     RemoveTokens,
     Report,
     Resume,
-    RunRecorded,
     SetBreakpoints,
     State,
     Step,
@@ -31,12 +30,10 @@ from coordinator.hmi.narrator import Narrator
 from coordinator.mission import Stage
 from coordinator.partners import FirstAlternative
 from coordinator.realtime import RealtimeMission
-from services.comm.messages import Command
+from coordinator.watching import Watching, shown_selectors
 from services.comm.notice import Progress
 
 FREE = frozenset({"estop", "take_controls", "ask_controls", "release_controls"})
-POLL = 0.5
-"""Seconds between questions to the nodes how their devices are, while somebody watches."""
 ANSWERS = 1.5
 """Seconds that nodes have to answer a pause."""
 REFUSED = frozenset({"refused"})
@@ -57,29 +54,29 @@ class Operation:
         self._asking: list[str] = []
         self._refusals: list[str] = []
         self._clients = 0
-        self._numbers = 0
         loop = asyncio.get_running_loop()
         where = {name: entry.node for name, entry in self.executor.directory.actions.items()}
         self.narrator = Narrator(self.feed, self.executor.task, where, loop.time())
-        self.narrator.begin(self.executor.mission, "realtime", controls=self._controls(), selectors=self._selectors())
+        self.narrator.begin(
+            self.executor.mission,
+            "realtime",
+            controls=self._controls(),
+            selectors=shown_selectors(self.executor.task, selector),
+        )
         self.executor.observers.extend([self.narrator, self])
-        self._polling = loop.create_task(self._poll())
+        self.watching = Watching(shell, self.feed, selector, loop.time(), lambda: self._clients > 0)
+        self.executor.observers.append(self.watching)
 
     async def close(self) -> None:
         """Ask the nodes no more."""
-        self._polling.cancel()
-        await asyncio.gather(self._polling, return_exceptions=True)
+        await self.watching.close()
 
     # --- an observer of the executor -------------------------------------------------------------------------------
 
     def instruction(self, now: float, instruction: Instruction) -> None:
-        """Keep what the engine refuses, for the answer to the command; show what was learned of a run's end."""
+        """Keep what the engine refuses, for the answer to the command."""
         if isinstance(instruction, Report) and instruction.key in REFUSED:
             self._refusals.append(instruction.text)
-        elif isinstance(instruction, RunRecorded) and self._selector.figures(instruction.primitive_task):
-            name = instruction.primitive_task
-            selector = {**self.feed.state["selectors"].get(name, {}), "alternatives": self._alternatives(name)}
-            self.feed.emit("selector", name=name, selector=selector)
 
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
         """Nothing to keep."""
@@ -208,15 +205,6 @@ class Operation:
         self.feed.emit("selector", name=task, selector=selector)
         return {"ok": True}
 
-    def _selectors(self) -> dict[str, Any]:
-        return {
-            n: {"alternatives": self._alternatives(n), "override": None} for n in self.executor.task.primitive_tasks
-        }
-
-    def _alternatives(self, task: str) -> list[dict[str, Any]]:
-        figures = self._selector.figures(task)
-        return [{"action": a, **figures.get(a, {})} for a in self.executor.task.primitive_tasks[task].alternatives]
-
     def _order(self, stimulus: Stimulus) -> Answer:
         if self.mission.stage is not Stage.RUNNING:
             return _no("idle", f"the mission run is {self.mission.stage.value}")
@@ -230,7 +218,7 @@ class Operation:
 
     async def _do_estop(self, who: str, data: Mapping[str, Any]) -> Answer:
         for node in self.mission.callers:
-            self._ask_node(node, "emergency_stop")
+            self.watching.ask(node, "emergency_stop")
         answer = self._order(Abort(f"emergency stop by {who}"))
         self.feed.emit("mission", mission={"state": "stopped", "reason": f"emergency stop by {who}"})
         return answer if answer["ok"] or answer["code"] != "idle" else {"ok": True}
@@ -238,40 +226,8 @@ class Operation:
     async def _do_clear_estop(self, who: str, data: Mapping[str, Any]) -> Answer:
         """Devices take orders again; nothing moves by that alone."""
         for node in self.mission.callers:
-            self._ask_node(node, "clear_emergency")
+            self.watching.ask(node, "clear_emergency")
         return {"ok": True}
-
-    def _ask_node(self, node: str, verb: str) -> None:
-        self._numbers += 1
-        now = asyncio.get_running_loop().time()
-        self.mission.callers[node].command(
-            now, Command(f"{self.executor.mission}/operator/{verb}#{self._numbers}", verb)
-        )
-        self.shell.clients[node].flush(now)
-
-    async def _poll(self) -> None:
-        """Keep health of nodes and state of devices fresh while somebody watches."""
-        self.executor.on_status = self._status
-        while True:
-            for node, caller in self.mission.callers.items():
-                state = "up" if caller.up else "lost" if node in self.mission.lost else "connecting"
-                entry = {"state": state, "text": self.mission.lost.get(node, "")}
-                if self.feed.state["nodes"].get(node) != entry:
-                    self.feed.emit("node", name=node, node=entry)
-                if self._clients and caller.up:
-                    self._ask_node(node, "status")
-            await asyncio.sleep(POLL)
-
-    def _status(self, data: Mapping[str, Any]) -> None:
-        for name, about in dict(data.get("devices", {})).items():
-            state = dict(about.get("state", {})) if isinstance(about, Mapping) else {}
-            if name not in self.executor.directory.devices or not state:
-                continue
-            values = {k: v for k, v in state.items() if isinstance(v, bool | int | float | str)}
-            device: dict[str, Any] = {"state": str(state.get("mode", "up")), "values": values}
-            if isinstance(state.get("q"), list | tuple):
-                device["joints"] = [float(angle) for angle in state["q"]]
-            self.feed.emit("device", name=name, device=device)
 
     async def _until(self, ready: Callable[[], bool], timeout: float) -> None:
         deadline = asyncio.get_running_loop().time() + timeout

@@ -98,6 +98,24 @@ class QuickStopping(Protocol):
         """Emergency stop (IEC 60204-1, category 0 or 1): stop at once. It stays stopped: no command comes until it is cleared."""
 
 
+PICTURE = "picture"
+"""The operator's command for what a device sees."""
+
+
+@runtime_checkable
+class Watched(Protocol):
+    """A driver that can show its operator a picture of what it sees."""
+
+    def picture(self) -> Mapping[str, Any]:
+        """The newest one: `mime`, `data` (bytes), `width`, `height` (px), `age` (s), `note` and `detections` as in
+        docs/operator-protocol.md; empty when there is none. Asked for a few times a second, and only while somebody looks."""
+
+
+def picture_of(driver: Driver | None) -> Mapping[str, Any]:
+    """The picture of a device, empty for one that has none."""
+    return driver.picture() if isinstance(driver, Watched) else {}
+
+
 def stop_at_once(driver: Driver, now: float) -> None:
     """Emergency stop of a device: its driver's `quick_stop` if there is one, else its stop routine."""
     if isinstance(driver, QuickStopping):

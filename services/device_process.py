@@ -15,7 +15,7 @@ import time
 from typing import Any
 
 from services.comm.plain import plain
-from services.device import Driver
+from services.device import PICTURE, Driver, picture_of
 from services.pipe import NewestLink, Pipe
 from services.ports import ProcessPorts
 from services.remote import CLEAR_EMERGENCY, EMERGENCY_STOP, CyclicDriver, DeviceCommand
@@ -137,6 +137,8 @@ class DeviceLoop:
             elif verb == "release":
                 self._driver.release(now)
                 self._tell(id_, "released")
+            elif verb == PICTURE:
+                self._node.post(flat(Told(id_, PICTURE, picture_of(self._driver))))
             else:
                 self._tell(id_, "up")
 

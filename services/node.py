@@ -15,6 +15,7 @@ from services.comm.messages import Call, Executed, Hello, Outcome
 from services.comm.notice import Ended as CallEnded
 from services.comm.notice import Notice
 from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
+from services.device import PICTURE
 from services.inline_service import inline_service
 from services.memory import Memory, event_name
 from services.place import InlinePlace, Place
@@ -30,7 +31,7 @@ STREAM_PREFIX = "stream:"
 """Name of a stream's address service: this and the stream's name."""
 ANSWER_WITHIN = 1.0
 """Seconds that the devices have to answer an operator's command."""
-VERBS = frozenset({"hold", "release", "stop", "status", EMERGENCY_STOP, CLEAR_EMERGENCY})
+VERBS = frozenset({"hold", "release", "stop", "status", PICTURE, EMERGENCY_STOP, CLEAR_EMERGENCY})
 """What a COMMAND may order."""
 _OWN_CAUSES = ("deadline", "orphan", EMERGENCY_STOP)
 _WELL_HELD = ("held", "stopped")

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 from services.comm.directory import ActionEntry
-from services.device import Driver, stop_at_once
+from services.device import PICTURE, Driver, picture_of, stop_at_once
 from services.remote import CLEAR_EMERGENCY, EMERGENCY_STOP, CyclicDriver, DeviceCommand, DirectDevice, RemoteDriver
 from services.runner import DeviceControl, Runner
 from services.runs import Hold, Order, Report, Stop, Told
@@ -22,8 +22,8 @@ class Place(Protocol):
         """Take an order about a run."""
 
     def command(self, now: float, id: str, verb: str) -> None:  # noqa: A002
-        """Carry out an operator's `hold`, `release`, `stop`, `emergency_stop`, `clear_emergency` or `status`; a report
-        `Told` with this id answers it."""
+        """Carry out an operator's `hold`, `release`, `stop`, `emergency_stop`, `clear_emergency`, `status` or `picture`;
+        a report `Told` with this id answers it."""
 
     def advance(self, now: float) -> None:
         """Do all that is due."""
@@ -117,6 +117,8 @@ class InlinePlace:
             if self._cyclic:
                 self._cyclic.clear_emergency()
             return "cleared", {}
+        if verb == PICTURE:
+            return PICTURE, picture_of(driver)
         state = dict(driver.state()) if driver else {}
         return "up", {"runs": list(self._runner.runs), "fenced": self._runner.fenced, "state": state}
 

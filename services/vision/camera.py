@@ -5,10 +5,12 @@ from __future__ import annotations
 import tomllib
 from collections import deque
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 
 from services.action import Context
 from services.comm.image import Image
@@ -22,9 +24,24 @@ CELL = Path(__file__).parents[1] / "cell.toml"
 REMEMBERED = 256
 """Images whose times are remembered, for a tracker that goes on where a locator ended."""
 
+QUALITY = 75
+"""Of JPEGs for the operator (0 to 100)."""
+SHOWN_RADIUS_PX = 12.0
+MOST_SHOWN = 8
+"""Candidates that are drawn over an image."""
+
 
 class CameraError(ValueError):
     """The camera's config or its images cannot be used; the text says what to change."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """What an action saw in an image, for the operator: places in px, shape (n, 2), or `table` places in m for what it predicts."""
+
+    label: str
+    pixels: Any = ()
+    table: Any = ()
 
 
 class Camera:
@@ -53,6 +70,9 @@ class Camera:
         self._detectors: dict[str, Detector] = {}
         self._times: deque[tuple[int, float]] = deque(maxlen=REMEMBERED)
         self._newest: Image | None = None
+        self._shown: Image | None = None
+        self.marks: tuple[Mark, ...] = ()
+        """What was seen in the image read last; actions set it, the operator's picture shows it."""
         self._rate = 0.0
         self._count = 0
 
@@ -95,6 +115,7 @@ class Camera:
                 "change [camera] of the cell and calibrate again"
             )
         self._count += 1
+        self._shown, self.marks = image, ()
         self._times.append((image.sequence, image.time))
         return image
 
@@ -126,6 +147,39 @@ class Camera:
     def state(self) -> Mapping[str, Any]:
         """Plain data for operator and report."""
         return {"rate": self._rate, "images": self._count, "background_images": self.background.images}
+
+    def picture(self) -> Mapping[str, Any]:
+        """The image read last with what was seen in it, as a JPEG; empty before the first."""
+        image = self._shown
+        if image is None:
+            return {}
+        coded, data = cv2.imencode(".jpg", image.pixels, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+        if not coded:
+            return {}
+        high, wide = image.pixels.shape
+        return {
+            "mime": "image/jpeg",
+            "data": data.tobytes(),
+            "width": wide,
+            "height": high,
+            "age": self._ports.now - image.time,
+            "note": f"image {image.sequence}, {self._rate:g} images/s",
+            "detections": [shape for mark in self.marks for shape in self._shapes(mark)],
+        }
+
+    def _shapes(self, mark: Mark) -> list[dict[str, Any]]:
+        """A mark in the page's words: circles where something was found, one path along what was predicted."""
+        found = [(float(x), float(y)) for x, y in mark.pixels]
+        shapes: list[dict[str, Any]] = [
+            {"kind": "circle", "role": "found", "label": mark.label, "x": x, "y": y, "r": SHOWN_RADIUS_PX}
+            for x, y in found[:MOST_SHOWN]
+        ]
+        ahead = [[float(v) for v in self.view.to_pixels(np.asarray(point, dtype=float))] for point in mark.table]
+        if ahead:
+            shapes.append({"kind": "path", "role": "predicted", "points": ahead})
+            last = {"kind": "point", "role": "predicted", "label": mark.label, "x": ahead[-1][0], "y": ahead[-1][1]}
+            shapes.append(last)
+        return shapes
 
     def stop(self, now: float) -> None:
         """Take no more images."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from services.action import Cancelled, Context, Result, error, failure, success
 from services.comm.image import Image
-from services.vision.camera import Camera, CameraError
+from services.vision.camera import Camera, CameraError, Mark
 from services.vision.confirmation import Confirmation, Track
 from services.vision.location import Detector, MixtureOfGaussians
 from services.vision.specification import Specification
@@ -90,6 +90,7 @@ class _Search:
         background = self._camera.background
         candidates = self._detector.detect(image.pixels)
         places = self._camera.view.to_table(candidates) if len(candidates) else candidates
+        self._camera.marks = (Mark("candidate", pixels=candidates),)
         if not background.known or self._images % LEARN_EVERY == 0:
             background.learn(image.pixels)
         return self._confirmation.add(image.time, places)

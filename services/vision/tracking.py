@@ -10,7 +10,7 @@ import numpy as np
 
 from services.action import Cancelled, Context, Result, error, failure, success
 from services.comm.image import Image
-from services.vision.camera import Camera, CameraError
+from services.vision.camera import Camera, CameraError, Mark
 from services.vision.location import Window
 from services.vision.prediction import Exit, Predictor, Surface, Way
 from services.vision.specification import Specification
@@ -140,10 +140,19 @@ class _Chase:
         x, y = view.to_table(seen.centre)
         self._predictor.add(image.time, float(x), float(y))
         self._seen, self._misses, self._seen_at = self._seen + 1, 0, image.time
-        return self._predicted(image.time)
+        ended = self._predicted(image.time)
+        self._mark((seen.centre,), (float(x), float(y)))
+        return ended
+
+    def _mark(self, centres: tuple[Any, ...], place: tuple[float, float]) -> None:
+        """For the operator: where the ball is seen, and the way to where it is predicted to leave."""
+        exit_ = self._exit
+        ahead = () if exit_ is None else (place, (float(exit_.point[0]), float(exit_.point[1])))
+        self._camera.marks = (Mark("ball", pixels=centres), Mark("predicted exit", table=ahead))
 
     def _missed(self, time: float, expected: Any) -> Result | None:
         self._misses += 1
+        self._mark((), (float(expected[0]), float(expected[1])))
         edge = self._camera.view.near_edge
         if float(expected[0]) < edge + HIDDEN or time - self._seen_at < self._specification.lost_after:
             return None

@@ -23,6 +23,9 @@ port = {port}
 [devices.arm]
 node = "robot"
 driver = "tests.cli.cell:Arm"
+[streams.way]
+to = "arm"
+period = 0.02
 [actions.reach]
 run = "tests.cli.cell:reach"
 task = "work"
@@ -107,6 +110,8 @@ class Arm:
         self.moving = self.held = False
         self.reaches = 0
         self.quick_stops: list[float] = []
+        self.sees = b""
+        self.setpoint_age: float | None = None
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
         """Begin to reach."""
@@ -122,7 +127,12 @@ class Arm:
 
     def state(self) -> Mapping[str, Any]:
         """How often it has reached."""
-        return {"reaches": self.reaches, "moving": self.moving, "held": self.held}
+        state = {"reaches": self.reaches, "moving": self.moving, "held": self.held, "q": [0.0, 1.5]}
+        return state if self.setpoint_age is None else {**state, "setpoint_age": self.setpoint_age}
+
+    def picture(self) -> Mapping[str, Any]:
+        """What the test shows it."""
+        return {"mime": "image/png", "data": self.sees, "width": 2, "height": 1, "age": 0.5} if self.sees else {}
 
     def stop(self, now: float) -> None:
         """Stand."""

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from services.action import Result, Status
 from services.comm.image import Image
+from services.vision.actions import locate_background, predict_least_squares
 from services.vision.calibration_file import DEFAULT, CalibrationFileError
 from services.vision.camera import CELL, Camera, CameraError
 from services.vision.location import FixedThreshold
-from tests.vision.bench import Bench, BenchContext, BenchPorts, run_action
+from tests.vision.bench import Bench, BenchContext, BenchPorts, draw_ball, run_action
 
 
 def test_shipped_files_are_the_default_and_others_can_be_named(bench: Bench) -> None:
@@ -120,3 +122,25 @@ def test_a_source_that_cannot_be_opened_is_no_image(context: BenchContext) -> No
     assert (located.status, located.cause) == (Status.ERROR, "no_image")
     assert "cannot be opened" in located.text
     camera.background.learn(np.zeros((2, 2), np.uint8))
+
+
+def test_the_operator_sees_what_was_seen(context: BenchContext) -> None:
+    """The newest image as a JPEG, the ball where it was found, the way to its predicted exit; nothing before the first."""
+    camera, bench = context.device, context.bench
+    assert camera.picture() == {}
+    bench.ball = draw_ball(np.random.default_rng(4), "A")
+    located = run_action(bench, locate_background(context))
+    assert located.status is Status.SUCCESS
+    seen = camera.picture()
+    decoded = cv2.imdecode(np.frombuffer(seen["data"], np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert decoded is not None and decoded.shape == (seen["height"], seen["width"]) == (480, 640)
+    assert np.abs(decoded.astype(float) - bench.picture()).mean() < 20.0
+    (found,) = [d for d in seen["detections"] if d["role"] == "found"]
+    where = camera.view.to_table(np.array([[found["x"], found["y"]]]))[0]
+    _, x, y = located.values["ball"]["places"][-1]
+    assert np.hypot(where[0] - x, where[1] - y) < 0.01
+    tracked = run_action(bench, predict_least_squares(context, ball=located.values["ball"]))
+    path = [d for d in camera.picture()["detections"] if d["kind"] == "path"]
+    assert path, camera.picture()["detections"]
+    left = camera.view.to_table(np.array([path[0]["points"][-1]]))[0]
+    assert np.hypot(*(left - tracked.values["exit"]["point"][:2])) < 0.01

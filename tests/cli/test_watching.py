@@ -1,0 +1,63 @@
+"""What operators see beside the net: pictures, devices and set points of nodes, only while somebody looks."""
+
+from __future__ import annotations
+
+from base64 import b64decode
+from typing import Any
+
+from tests.cli.conftest import Terminal
+
+
+def verbs(terminal: Terminal) -> list[str]:
+    """What the node has been asked beside its calls, in order."""
+    asked: list[str] = []
+    place: Any = terminal.robot.node.places["arm"]
+    carry_out = place.command
+
+    def command(now: float, id: str, verb: str) -> None:  # noqa: A002
+        asked.append(verb)
+        carry_out(now, id, verb)
+
+    place.command = command
+    return asked
+
+
+async def test_pictures_and_states_come_while_somebody_looks(petrobot: Terminal) -> None:
+    """The newest picture as text that a page can show, joints and values of the device, the age of its set points."""
+    petrobot.arm.sees, petrobot.arm.setpoint_age = b"not really a picture", 0.012
+    feed = petrobot.operation.feed
+    changes: list[dict[str, Any]] = []
+    stop = petrobot.operation.subscribe(changes.append)
+    await petrobot.until(lambda: bool(feed.state["images"] and feed.state["setpoints"] and feed.state["devices"]))
+    stop()
+    image = feed.state["images"]["arm"]
+    assert b64decode(image["data"]) == petrobot.arm.sees
+    assert (image["mime"], image["width"], image["height"], image["age"]) == ("image/png", 2, 1, 0.5)
+    assert feed.state["devices"]["arm"]["joints"] == [0.0, 1.5]
+    (time, age), *_ = feed.state["setpoints"]["way"]["samples"]
+    assert age == 0.012 and time > 0.0
+
+
+async def test_nobody_looks_nothing_is_asked(petrobot: Terminal) -> None:
+    """A node hears of no operator while there is none, and again once one looks."""
+    asked = verbs(petrobot)
+    feed = petrobot.operation.feed
+    polled: list[dict[str, Any]] = []
+    petrobot.operation.watching._health = lambda node, up: polled.append({node: up})  # type: ignore[method-assign]
+    await petrobot.until(lambda: len(polled) > 3)
+    assert asked == [] and feed.state["images"] == {}
+    stop = petrobot.operation.subscribe(lambda change: None)
+    await petrobot.until(lambda: {"status", "picture"} <= set(asked))
+    stop()
+
+
+async def test_old_set_points_are_none(petrobot: Terminal) -> None:
+    """A stream that nobody sends is not shown as one that grows older and older; a device that sees nothing shows nothing."""
+    petrobot.arm.setpoint_age = 3.0
+    stop = petrobot.operation.subscribe(lambda change: None)
+    feed = petrobot.operation.feed
+    await petrobot.until(lambda: feed.state["devices"].get("arm", {}).get("values", {}).get("setpoint_age") == 3.0)
+    asked = verbs(petrobot)
+    await petrobot.until(lambda: asked.count("picture") >= 2)
+    stop()
+    assert feed.state["setpoints"] == {} and feed.state["images"] == {}
