@@ -97,7 +97,8 @@ class LearningSelector(FirstAlternative):
 
     `chosen`: actions that the user fixed; what is learned of them counts nevertheless. `live`: records are applied as they
     come; False for a worker of a campaign, whose records are applied later, in order, to the one state of all. `generation`:
-    how many mission runs were learned from before, so that the draws of a second run with the same seed are others.
+    how many mission runs were learned from before, so that the draws of a second run with the same seed are others. `declared`:
+    in lock step the compute time (s) of each action as services.toml declares it, so that measured CPU time never steers there.
     """
 
     def __init__(
@@ -109,6 +110,7 @@ class LearningSelector(FirstAlternative):
         seed: int = 0,
         generation: int = 0,
         live: bool = True,
+        declared: Mapping[str, float] | None = None,
     ) -> None:
         super().__init__(chosen)
         self.learning = learning
@@ -117,6 +119,7 @@ class LearningSelector(FirstAlternative):
         self.records: list[Record] = []
         """Everything that was learned from, in order."""
         self._seed, self._generation, self._live = seed, generation, live
+        self._declared = declared
         self._values: Mapping[str, Any] = {}
         self._going: dict[str, _Going] = {}
         self._deferred: dict[str, End] = {}
@@ -232,7 +235,7 @@ class LearningSelector(FirstAlternative):
             seconds,
             record.cause,
             record.executed,
-            result.cpu_seconds if result is not None else None,
+            self._cpu(record, result),
             _numbers(result.values) if result is not None and preempted is None else {},
             preempted,
             round(max(0.0, now - going.entered - seconds), 6) if preempted is None else None,
@@ -241,6 +244,12 @@ class LearningSelector(FirstAlternative):
         if record.deferred:
             self._deferred[record.run] = end
         self._note(end)
+
+    def _cpu(self, record: RunRecorded, result: RunEnded | None) -> float | None:
+        """CPU seconds as measured; as declared where they are the cost and the run must come out the same again."""
+        if self._declared is not None and self.learning.question(record.primitive_task).measure == "cpu":
+            return self._declared.get(record.action, 0.0)
+        return None if result is None else result.cpu_seconds
 
     def _corrected(self, corrected: Corrected) -> None:
         end = self._deferred.pop(corrected.run, None)

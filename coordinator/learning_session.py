@@ -29,6 +29,8 @@ class LearningSetting:
     """Actions that the user fixed, by primitive task."""
     frozen: bool = False
     """Choose by what was learned, and write nothing."""
+    declared: Mapping[str, float] | None = None
+    """Lock step: declared compute time of each action (s)."""
 
     def to_plain(self) -> dict[str, Any]:
         """Plain data for a journal's header."""
@@ -39,13 +41,15 @@ class LearningSetting:
             "contexts": None if self.contexts is None else list(self.contexts),
             "chosen": dict(self.chosen),
             "frozen": self.frozen,
+            "declared": None if self.declared is None else dict(self.declared),
         }
 
     @classmethod
     def of_plain(cls, data: Mapping[str, Any]) -> LearningSetting:
         """What `to_plain` gave."""
         contexts = None if data["contexts"] is None else tuple(data["contexts"])
-        return cls(Path(data["path"]), data["selector"], data["target"], contexts, data["chosen"], data["frozen"])
+        given = (data["selector"], data["target"], contexts, data["chosen"], data["frozen"], data["declared"])
+        return cls(Path(data["path"]), *given)
 
 
 class LearningSession:
@@ -70,7 +74,13 @@ class LearningSession:
         self._token = secrets.token_hex(8) if begun is None else str(begun["token"])
         self._begun = self.learning.state()
         self.selector = LearningSelector(
-            self.learning, contexts, setting.chosen, seed=seed, generation=generation, live=not setting.frozen
+            self.learning,
+            contexts,
+            setting.chosen,
+            seed=seed,
+            generation=generation,
+            live=not setting.frozen,
+            declared=setting.declared,
         )
 
     def beginning(self) -> dict[str, Any]:

@@ -179,14 +179,18 @@ def _row(kept: Kept, task: str, f: Figures, options: argparse.Namespace) -> dict
 
 
 def _break_even(judged: Comparison) -> list[dict[str, Any]]:
-    """rho at which the best action would stop being so, against each other one."""
+    """rho at which the best action would stop being so, against each other one: `above` or `below` it the other is better."""
     from coordinator.learning.objective import break_even
 
     if judged.best is None:
         return []
     best = judged.of(judged.best)
-    found = ((other.action, break_even(best, other)) for other in judged.figures if other.action != best.action)
-    return [{"against": name, "rho": rho} for name, rho in found if rho is not None]
+    found = [(other, break_even(best, other)) for other in judged.figures if other.action != best.action]
+    return [
+        {"against": other.action, "rho": rho, "better": "above" if other.cost < best.cost else "below"}
+        for other, rho in found
+        if rho is not None
+    ]
 
 
 def _answer(figures: Figures | None) -> dict[str, Any] | None:
@@ -197,23 +201,26 @@ def _number(x: float) -> float | None:
     return x if isfinite(x) else None
 
 
-COLUMNS = ("action", "runs", "R", "R 95 %", "C", "J", "p50 s", "p90 s", "cpu ms", "A")
-
-
 def _print(task: str, about: dict[str, Any], options: argparse.Namespace) -> None:
+    from rich import box
     from rich.console import Console
     from rich.table import Table
 
     console = Console()
-    table = Table(title=f"{task} (rho {about['rho']:.4g})", title_justify="left")
-    for column in COLUMNS:
-        table.add_column(column, justify="left" if column == "action" else "right")
+    table = Table(
+        title=f"{task} (rho {about['rho']:.4g})", title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)
+    )
+    table.show_edge = table.pad_edge = False
+    always_there = all(row["A"] == 1.0 for row in about["actions"])
+    columns = ["action", "runs", "R", "R 95 %", "C", "J", "s p50/p90", "cpu ms", *([] if always_there else ["A"])]
+    for column in columns:
+        table.add_column(column, justify="left" if column == "action" else "right", no_wrap=True)
     for row in about["actions"]:
         name = row["action"] + (" *" if row["action"] == about["best"] else "")
-        interval = f"{row['R_low']:.3f} to {row['R_high']:.3f}"
-        cells = [row["R"], interval, row["C"], row["J"], row["seconds_p50"], row["seconds_p90"]]
+        times = f"{_cell(row['seconds_p50'])}/{_cell(row['seconds_p90'])}"
         cpu = None if row["cpu_mean"] is None else 1e3 * row["cpu_mean"]
-        table.add_row(name, str(row["runs"]), *(_cell(c) for c in cells), _cell(cpu), _cell(row["A"]))
+        cells = [row["R"], f"{row['R_low']:.2f}-{row['R_high']:.2f}", row["C"], row["J"], times, cpu, row["A"]]
+        table.add_row(name, str(row["runs"]), *[_cell(c) for c in cells][: len(columns) - 2])
     console.print(table)
     for line in _remarks(about, options):
         console.print(f"  {line}", highlight=False)
@@ -222,7 +229,7 @@ def _print(task: str, about: dict[str, Any], options: argparse.Namespace) -> Non
 def _cell(value: Any) -> str:
     if isinstance(value, str):
         return value
-    return "-" if value is None or isnan(value) or value in (inf, -inf) else f"{value:.4g}"
+    return "-" if value is None or isnan(value) or value in (inf, -inf) else f"{value:.3g}"
 
 
 def _remarks(about: dict[str, Any], options: argparse.Namespace) -> list[str]:
@@ -234,7 +241,7 @@ def _remarks(about: dict[str, Any], options: argparse.Namespace) -> list[str]:
         if row["causes"]:
             lines.append(f"{row['action']}: " + ", ".join(f"{n} {cause}" for cause, n in row["causes"].items()))
     lines += [
-        f"{about['best']} stays best until rho = {b['rho']:.4g}, then {b['against']}" for b in about["break_even"]
+        f"{b['against']} is better than {about['best']} {b['better']} rho = {b['rho']:.4g}" for b in about["break_even"]
     ]
     for key, words in (
         ("to_reach", f"R {options.target} costs least with"),

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from coordinator.learning_session import LearningSession
     from coordinator.partners import FirstAlternative
     from coordinator.task import Task
+    from services.comm.directory import Directory
 
 SELECTORS = (
     "nikolic_fu",
@@ -64,7 +65,9 @@ def _probability(text: str) -> float:
     return value
 
 
-def opened(task: Task, chosen: Mapping[str, str], options: argparse.Namespace) -> LearningSession | None:
+def opened(
+    task: Task, directory: Directory, chosen: Mapping[str, str], options: argparse.Namespace
+) -> LearningSession | None:
     """The session that the options ask for; None if they ask for none, and then no file is read."""
     if options.learn is None:
         for name in ("selector", "target", "context", "frozen"):
@@ -76,8 +79,9 @@ def opened(task: Task, chosen: Mapping[str, str], options: argparse.Namespace) -
     from coordinator.learning_session import LearningSession, LearningSetting
 
     contexts = None if options.context is None else tuple(part for part in options.context if part)
+    declared = {a.name: a.compute_time for a in directory.actions.values()} if options.mode == "lockstep" else None
     setting = LearningSetting(
-        options.learn, options.selector or DEFAULT, options.target, contexts, chosen, options.frozen
+        options.learn, options.selector or DEFAULT, options.target, contexts, chosen, options.frozen, declared
     )
     try:
         return LearningSession(task, setting, options.seed)

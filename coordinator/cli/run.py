@@ -138,7 +138,7 @@ def _setting(task: Task, directory: Directory, options: argparse.Namespace) -> S
             raise CommandError(2, f"--use {primitive}={action}: not known to {task.name}; choose among {choices}")
         if action not in directory.actions:
             raise CommandError(2, f"--use {primitive}={action}: {directory.source} places no action {action}")
-    options.learning = opened(task, chosen, options)
+    options.learning = opened(task, directory, chosen, options)
     learning = {} if options.learning is None else {"learning": options.learning.beginning()}
     options.chosen_by = {"chosen": chosen, **learning}
     selector = FirstAlternative(chosen) if options.learning is None else options.learning.selector

@@ -165,7 +165,7 @@ def _judged(figures: Figures, rho: float) -> Figures:
 
 
 def break_even(one: Figures, other: Figures) -> float | None:
-    """The rho at which two actions have the same J: below it the more reliable one is better; None if there is none.
+    """The rho above 0 at which two actions have the same J: below it the more reliable one is better; None if there is none.
 
     `one` beats `other` iff A R_one - A R_other > rho (C_one - C_other).
     """
@@ -173,7 +173,7 @@ def break_even(one: Figures, other: Figures) -> float | None:
     if price == 0 or isnan(price) or isnan(gain) or price in (inf, -inf):
         return None
     rho = gain / price
-    return rho if rho >= 0 else None
+    return rho if rho > 0 else None
 
 
 def pareto(figures: Iterable[Figures]) -> tuple[Figures, ...]:

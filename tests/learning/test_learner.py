@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -188,6 +189,24 @@ def test_firings_are_counted(task: Task) -> None:
     passages = [r for r in selector.records if isinstance(r, Passage)]
     assert len(passages) == mission.tally.firings
     assert {p.transition for p in passages if p.waited is not None} == {"begin"}
+
+
+@pytest.mark.parametrize("declared", [None, {"pick_slow": 0.25}])
+def test_measured_cpu_time_never_steers_in_lock_step(task: Task, declared: dict[str, float] | None) -> None:
+    """Where CPU time is the cost, lock step takes what services.toml declares; real time takes what was measured."""
+    costly = replace(
+        task,
+        primitive_tasks={**task.primitive_tasks, "pick": replace(task.primitive_tasks["pick"], cost="cpu")},
+    )
+    selector = LearningSelector(Learning(costly, "round_robin"), seed=1, declared=declared)
+    run(costly, selector, runs=9)
+    cpu = selector.learning.estimates.tally(Key("pick", "pick_slow", "regime=A")).cost("cpu")
+    cost = selector.learning.selectors["pick"].learner("regime=A").mean_cost()[0]
+    if declared is None:
+        assert 0 <= cpu.mean < 0.25
+    else:
+        assert (cpu.low, cpu.high) == (0.25, 0.25)
+        assert cost.tolist() == [0.0, 0.25, 0.0]
 
 
 def test_people_are_shown_what_was_learned(task: Task) -> None:

@@ -118,13 +118,12 @@ def test_break_even_is_where_j_is_equal(g1: int, b1: int, g2: int, b2: int, c1: 
     one, other = found.figures
     rho = break_even(one, other)
     if rho is None:
-        assert one.cost == other.cost or (one.reliability - other.reliability) * (one.cost - other.cost) < 0
+        assert one.cost == other.cost or (one.reliability - other.reliability) * (one.cost - other.cost) <= 0
         return
     at = [objective(f.reliability, f.cost, rho) for f in (one, other)]
     assert at[0] == pytest.approx(at[1], abs=1e-6)
-    if rho > 0 and one.reliability != other.reliability:
-        below = [objective(f.reliability, f.cost, rho / 2) for f in (one, other)]
-        assert (below[0] < below[1]) == (one.reliability > other.reliability)
+    below = [objective(f.reliability, f.cost, rho / 2) for f in (one, other)]
+    assert (below[0] < below[1]) == (one.reliability > other.reliability)
 
 
 @given(st.lists(st.tuples(st.integers(0, 10), st.integers(1, 10), st.floats(0.1, 9)), min_size=1, max_size=6))
