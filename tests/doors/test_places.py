@@ -1,0 +1,184 @@
+"""Emergency stops and pauses where the processes of a device are watched: latched over their deaths, gone with what was held."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+
+from services.action import Status
+from services.comm.messages import Executed
+from services.device import stop_at_once
+from services.remote import (
+    CLEAR_EMERGENCY,
+    EMERGENCY_STOP,
+    IN_EMERGENCY,
+    CyclicDriver,
+    DeviceCommand,
+)
+from services.runner import GRACE, Runner
+from services.runs import Begin, Ended, Hold, Stop, Told, flat
+from services.worker import COMMAND
+from tests.node.conftest import Clock, Device
+from tests.node.test_worker_place import Bench
+
+
+class Stopping:
+    """A driver that counts its stops; `quick` gives it a quick stop of its own."""
+
+    period: float | None = 0.004
+
+    def __init__(self) -> None:
+        self.did: list[str] = []
+
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        """Take any."""
+        self.did.append(str(body["do"]))
+
+    def step(self, now: float) -> None:
+        """Nothing."""
+
+    def state(self) -> Mapping[str, Any]:
+        """Nothing."""
+        return {}
+
+    def stop(self, now: float) -> None:
+        """The stop routine."""
+        self.did.append("stop")
+
+    def stopped(self) -> bool:
+        """Always."""
+        return True
+
+    def hold(self, now: float) -> str:
+        """Hold."""
+        return "held"
+
+    def release(self, now: float) -> None:
+        """Go on."""
+
+    def close(self) -> None:
+        """Nothing."""
+
+
+class QuickStopping(Stopping):
+    """One with a quick stop."""
+
+    def quick_stop(self, now: float) -> None:
+        """Harder than the stop routine."""
+        self.did.append("quick stop")
+
+
+@pytest.mark.parametrize(("driver", "did"), [(Stopping(), "stop"), (QuickStopping(), "quick stop")])
+def test_an_emergency_stop_is_the_drivers_hardest(driver: Stopping, did: str) -> None:
+    """Its quick stop if it has one, else its stop routine."""
+    stop_at_once(driver, 0.0)
+    assert driver.did == [did]
+
+
+def test_a_stopped_driver_takes_no_command_until_it_is_cleared() -> None:
+    """Not even `reset`; the stop routine is always taken. Clearing alone does nothing to the device."""
+    driver = QuickStopping()
+    cyclic = CyclicDriver(driver)
+    cyclic.emergency_stop(0.0)
+    cyclic.take(0.0, DeviceCommand(1, body={"do": "reset"}))
+    assert (cyclic.state().handled, cyclic.state().refused) == (1, IN_EMERGENCY)
+    cyclic.take(0.0, DeviceCommand(2, "stop"))
+    cyclic.clear_emergency()
+    assert driver.did == ["quick stop", "stop"]
+    cyclic.take(0.0, DeviceCommand(3, body={"do": "reset"}))
+    assert driver.did[-1] == "reset" and not cyclic.state().refused
+
+
+def orders_to(child: Any) -> list[str]:
+    """Verbs of the operator that a process was told."""
+    return [items[2] for items in child.got if items[0] == COMMAND]
+
+
+def test_the_driver_is_told_before_its_actions_are_stopped() -> None:
+    """The device waits for nobody; then each run ends as stopped in an emergency."""
+    bench = Bench()
+    driver, worker = bench.cyclic()
+    bench.begin("r")
+    bench.run(0.0)
+    bench.place.command(bench.clock.now, "e1", EMERGENCY_STOP)
+    assert orders_to(driver) == [EMERGENCY_STOP]
+    (stop,) = [order for order in worker.orders() if isinstance(order, Stop)]
+    assert (stop.id, stop.cause) == ("r", EMERGENCY_STOP)
+
+
+def test_a_driver_that_dies_comes_back_stopped() -> None:
+    """Its new process, which would enable its drives, is told at once; after clearing the next one is not."""
+    bench = Bench()
+    driver, _ = bench.cyclic()
+    bench.place.command(bench.clock.now, "e1", EMERGENCY_STOP)
+    driver.die()
+    bench.run(20.0)
+    again = bench.children[-1]
+    assert again is not driver
+    again.ready(0.004)
+    assert orders_to(again) == [EMERGENCY_STOP]
+    bench.children[-1].ready()
+    bench.place.command(bench.clock.now, "e2", CLEAR_EMERGENCY)
+    again.die()
+    bench.run(20.0)
+    third = bench.children[-1]
+    third.ready(0.004)
+    assert third is not again and orders_to(third) == []
+
+
+def test_a_hold_ends_with_the_runs_that_it_held() -> None:
+    """The last one ended (cancelled, say): the device is released, and the next run finds its time unspent."""
+    bench = Bench()
+    driver, worker = bench.cyclic()
+    bench.begin("one", deadline=1.0)
+    bench.run(0.0)
+    bench.place.command(bench.clock.now, "h1", "hold")
+    driver.say(flat(Told("h1", "held", {})))
+    assert Hold(True) in worker.orders()
+    bench.run(5.0)
+    worker.say(flat(Ended("one", Status.ERROR, {}, "cancelled", "", Executed.YES, 5.0)))
+    assert orders_to(driver) == ["hold", "release"]
+    assert worker.orders()[-1] == Hold(False)
+    bench.begin("two", deadline=1.0)
+    assert not [r for r in bench.run(0.9) if isinstance(r, Ended) and r.id == "two"]
+
+
+def test_a_hold_without_runs_stays_until_it_is_released() -> None:
+    """Nothing ended, so nothing lets it go."""
+    bench = Bench()
+    driver, _ = bench.cyclic()
+    bench.place.command(bench.clock.now, "h1", "hold")
+    driver.say(flat(Told("h1", "held", {})))
+    bench.run(5.0)
+    assert orders_to(driver) == ["hold"]
+    bench.place.command(bench.clock.now, "r1", "release")
+    assert orders_to(driver) == ["hold", "release"]
+
+
+def test_a_cancelled_run_of_a_held_device_calls_its_stop_routine() -> None:
+    """Held, the device looks as if it stood; released without having been stopped it would go on without its run."""
+    from services.comm.directory import ActionEntry
+
+    clock = Clock()
+    device = Device(clock, halting=0.0)
+
+    async def move(ctx: Any) -> Any:
+        await ctx.sleep(60.0)
+
+    entries = {"move": ActionEntry("move", "tests:none", "task", "here", "it")}
+    for held, stops in ((False, 0), (True, 1)):
+        runner = Runner(entries, clock=clock, device=device, substitutes={"move": move}, virtual=True)
+        device.stops.clear()
+        runner.take(clock.now, Begin("r", "move", {}, None, 1))
+        runner.advance(clock.now)
+        if held:
+            runner.take(clock.now, Hold(True))
+        runner.take(clock.now, Stop("r", "cancelled", "enough"))
+        clock.now += GRACE + 0.01
+        runner.advance(clock.now)
+        runner.advance(clock.now)
+        assert len(device.stops) == stops
+        (end,) = [report for report in runner.reports() if isinstance(report, Ended)]
+        assert end.cause == "cancelled"
