@@ -1,0 +1,73 @@
+"""Seeded chaos in real time: every mission run ends with a reason, nothing is executed twice, nothing is left behind."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.chaos.shuttle_cell import ROOT
+
+pytestmark = pytest.mark.processes
+SHORT, LONG = 20.0, 600.0
+NAMESPACE = ("unshare", "--user", "--map-root-user", "--net")
+
+
+def storm(folder: Path, seed: int, seconds: float, *, lo: bool = False) -> dict[str, Any]:
+    """What a storm tells (tests/chaos/storm.py), in a network namespace of its own if the loopback is to be taken down."""
+    command = [sys.executable, "-m", "tests.chaos.storm", str(seed), str(seconds), str(folder)]
+    command = [*NAMESPACE, *command, "--lo"] if lo else command
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    told: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    print(told)
+    return told
+
+
+def judge(told: dict[str, Any]) -> None:
+    """All that must hold in any weather."""
+    assert told["faults"] == []
+    assert told["missions"] >= 3 and sum(told["weather"].values()) >= 10, "hardly a storm"
+    assert set(told["ends"]) <= {"success", "error"}
+    assert told["twice"] == [], "an action was executed twice"
+    assert told["overlaps"] == [], "two performers for one hand"
+    assert told["executed"] <= told["calls"]
+    assert told["processes"] == [] and told["sockets"] <= 0, "something was left behind"
+
+
+def namespace_permitted() -> bool:
+    """Whether this user may have a network namespace of its own and set its loopback."""
+    if not shutil.which("unshare") or not shutil.which("ip"):
+        return False
+    tried = subprocess.run([*NAMESPACE, "ip", "link", "set", "lo", "up"], capture_output=True, check=False)
+    return tried.returncode == 0
+
+
+needs_namespace = pytest.mark.skipif(
+    not namespace_permitted(), reason="no network namespace here: needs unshare and ip, and user namespaces permitted"
+)
+
+
+def test_a_short_storm(tmp_path: Path) -> None:
+    judge(storm(tmp_path, 1, SHORT))
+
+
+@needs_namespace
+@pytest.mark.proof
+def test_a_storm_that_takes_the_loopback_down(tmp_path: Path) -> None:
+    told = storm(tmp_path, 2, 3 * SHORT, lo=True)
+    judge(told)
+    assert told["weather"]["lo_down"] >= 1
+
+
+@pytest.mark.proof
+def test_ten_minutes_of_storm(tmp_path: Path) -> None:
+    lo = namespace_permitted()
+    told = storm(tmp_path, 3, LONG, lo=lo)
+    judge(told)
+    assert told["missions"] >= 50
