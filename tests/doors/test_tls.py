@@ -18,6 +18,7 @@ from services.comm import messages as m
 from services.comm.caller import Caller
 from services.comm.client import Client
 from services.comm.credentials import Credentials, may_speak_as
+from services.comm.directory import DirectoryError, parse
 from services.comm.security import KeyFileError
 from tests.doors.conftest import HELLO, Victim
 
@@ -226,3 +227,33 @@ async def test_client_tells_why_it_is_lost(victim: Start, certificates: Path, tm
         while "our certificate is not trusted" not in client.trouble:
             await asyncio.sleep(0.005)
     await client.close()
+
+
+# --- the shared key ---------------------------------------------------------------------------------------------------------
+
+
+def test_keys_makes_one_shared_key(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A file for its owner's eyes alone, never shown, never overwritten, with the lines for services.toml."""
+    services, file = str(services_in(tmp_path)), tmp_path / "cell.key"
+    assert main(["keys", "--file", str(file), "--services", services]) == 0
+    said = capsys.readouterr().out
+    key = file.read_text().strip()
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600 and len(key) == 64
+    assert key not in said and 'file = "cell.key"' in said and "192.168.7.2, 192.168.7.3" in said
+    assert main(["keys", "--file", str(file), "--services", services]) == 2
+    assert "exists already" in capsys.readouterr().err and file.read_text().strip() == key
+
+
+@pytest.mark.parametrize(
+    ("keys", "says"),
+    [
+        ('flie = "cell.key"', "keys.flie: unknown; .*did you mean 'file'"),
+        ('file = "cell.key"\ncertificates = "keys"', "keys: a shared key and certificates; name one of them"),
+        ("file = 3", "keys.file: is 3; write the path of a file or folder"),
+    ],
+)
+def test_faults_of_the_keys_table_are_named(tmp_path: Path, keys: str, says: str) -> None:
+    """File, line, key and remedy."""
+    path = services_in(tmp_path)
+    with pytest.raises(DirectoryError, match=says):
+        parse(path.read_text() + f"[keys]\n{keys}\n", path)
