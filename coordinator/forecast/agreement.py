@@ -13,10 +13,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.stats import betabinom, binom, chi2_contingency, norm, t
+from scipy.stats import binom, chi2_contingency, norm, t
 
 from coordinator.forecast.history import Training, Values
 from coordinator.forecast.predict import GRID, SHARES, figures, measured, routing
+from coordinator.forecast.shares import predictive_interval, share_p_value, share_weight
 from coordinator.learning.intervals import wilson
 
 FAMILY = ("R_goal", "P_complete", "mean", "q90")
@@ -98,34 +99,6 @@ def _row(regime: str, figure: str, said: Mapping[str, Any], training: Training) 
     row["measured_90"] = [round(low, 6), round(high, 6)]
     row["equivalent"] = abs(low - found["value"]) <= row["margin"] and abs(high - found["value"]) <= row["margin"]
     return row
-
-
-def share_weight(value: float, sd: float, runs: int, training: int) -> float:
-    """How many throws the forecast of a share weighs: from its predictive deviation less the noise of `runs` new throws.
-
-    At most as much as the training throws themselves; exactly that where the bootstrap saw no variation.
-    """
-    noise = value * (1.0 - value)
-    own = sd * sd - noise / runs
-    return float(training) if noise <= 0.0 or own <= noise / training else max(2.0, noise / own)
-
-
-def _beta(value: float, weight: float) -> tuple[float, float]:
-    return value * weight + 0.5, (1.0 - value) * weight + 0.5
-
-
-def predictive_interval(value: float, weight: float, n: int, level: float = 0.95) -> list[float]:
-    """In which a share of n new throws is expected."""
-    a, b = _beta(value, weight)
-    low, high = betabinom.ppf([(1 - level) / 2, (1 + level) / 2], n, a, b)
-    return [round(float(low) / n, 6), round(float(high) / n, 6)]
-
-
-def share_p_value(value: float, weight: float, count: int, n: int) -> float:
-    """Two-sided p-value of `count` successes among n new throws."""
-    a, b = _beta(value, weight)
-    below, above = float(betabinom.cdf(count, n, a, b)), float(betabinom.sf(count - 1, n, a, b))
-    return min(1.0, 2.0 * min(below, above))
 
 
 def time_p_value(value: float, sd: float, seen: float, runs: int, n: int, training: int) -> float:

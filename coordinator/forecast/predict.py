@@ -9,9 +9,10 @@ import numpy as np
 from scipy.stats import chi2_contingency
 
 from coordinator.forecast.history import Training, Values
-from coordinator.forecast.laws import Laws, dependences, first_statuses
+from coordinator.forecast.laws import Laws, dependences
 from coordinator.forecast.play import Choices, Play, Played
 from coordinator.forecast.sampling import Drawer
+from coordinator.forecast.shares import predictive_interval, share_weight
 from coordinator.forecast.structure import SUCCESS, Structure
 
 POINT = 40_000
@@ -84,7 +85,9 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
     return {
         "training_throws": len(training.throws),
         "runs": request.runs,
-        "figures": {name: _figure(name, point[name], samples[name], request) for name in (*SHARES, *TIMES)},
+        "figures": {
+            name: _figure(name, point[name], samples[name], request, len(training.throws)) for name in (*SHARES, *TIMES)
+        },
         "product": product_rule(training, request.choices),
         "law": {"q": list(GRID), "s": _rounded(np.quantile(times, GRID)) if len(times) else []},
         "distance_99": round(float(np.quantile(distances, 0.99)), 6),
@@ -161,13 +164,16 @@ def distance(sample: Values, reference: Values) -> float:
     return float(max(np.max(np.abs(at - steps[1:])), np.max(np.abs(below - steps[:-1]))))
 
 
-def _figure(name: str, value: float, samples: Values, request: Request) -> dict[str, Any]:
+def _figure(name: str, value: float, samples: Values, request: Request, training: int) -> dict[str, Any]:
     known = samples[~np.isnan(samples)]
     if not len(known):
         return {"value": None, "interval": None, "sd": None}
-    low, high = np.quantile(known, ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
-    found = {"value": round(value, 6), "interval": [round(float(low), 6), round(float(high), 6)]}
-    return {**found, "sd": round(float(known.std(ddof=1)) if len(known) > 1 else 0.0, 8)}
+    sd = float(known.std(ddof=1)) if len(known) > 1 else 0.0
+    if name in SHARES:
+        interval = predictive_interval(value, share_weight(value, sd, request.runs, training), request.runs, LEVEL)
+    else:
+        interval = _rounded(np.quantile(known, ((1 - LEVEL) / 2, (1 + LEVEL) / 2)))
+    return {"value": round(value, 6), "interval": interval, "sd": round(sd, 8)}
 
 
 def product_rule(training: Training, choices: Choices) -> dict[str, Any]:
@@ -236,8 +242,3 @@ def routing(training: Training) -> dict[str, dict[str, int]]:
 
 def _rounded(values: Values) -> list[float]:
     return [round(float(v), 6) for v in values]
-
-
-def statuses_together(training: Training) -> np.ndarray:
-    """(places, throws): status of each place's first run."""
-    return first_statuses(training.vocabulary, training.runs, len(training.throws))

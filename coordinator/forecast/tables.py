@@ -17,7 +17,7 @@ HEAD = ("regime", "figure", "forecast", "95 % predictive", "measured", "p (Holm)
 
 def forecast_text(made: Mapping[str, Any]) -> str:
     """A forecast for people."""
-    lines = [f"{made['task']}: {made['method']}"]
+    lines = [f"{made['task']}: forecast of {made['registered_at']}"]
     for name, said in made["regimes"].items():
         lines.append(f"  regime {name or '-'}: {said['runs']} runs, from {said['training_throws']} throws")
         for figure, found in said["figures"].items():

@@ -1,0 +1,242 @@
+"""Playing a net: branches side by side, timers, conditions, loops, inhibitors and dead ends, each against what is known by hand."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coordinator.campaign.throws import RunEntry, Throw
+from coordinator.forecast.history import Training
+from coordinator.forecast.laws import Laws
+from coordinator.forecast.play import Play, Played
+from coordinator.forecast.predict import choices_of
+from coordinator.forecast.sampling import Drawer
+from coordinator.forecast.structure import Structure
+from coordinator.taskfile import loads
+
+HEAD = """
+schema = 1
+[task]
+name = "net"
+{task}
+[primitive_tasks.a]
+goal = "a"
+alternatives = ["run_a"]
+deadline = 99.0
+[primitive_tasks.b]
+goal = "b"
+alternatives = ["run_b"]
+deadline = 99.0
+[places.jobs]
+kind = "control"
+tokens = 1
+[places.a]
+kind = "action"
+task = "a"
+[places.b]
+kind = "action"
+task = "b"
+[places.end]
+kind = "control"
+"""
+
+
+def play(
+    text: str, throws: list[Throw], n: int = 2000, task: str = 'final = "end == 1"\nruns_place = "jobs"'
+) -> Played:
+    """Throws of a task played from what was measured."""
+    training = Training.of(loads(HEAD.replace("{task}", task) + text, "net.toml"), throws)
+    random = np.random.default_rng(1)
+    drawer = Drawer(Laws(training), training.waits, np.ones((1, len(throws))), random)
+    return Play(Structure.of(training.task), drawer, choices_of(training), np.zeros(n, np.int64)).run()
+
+
+def entry(place: str, took: float, status: str = "success", taken: str = "", **more: Any) -> RunEntry:
+    """A run that ended."""
+    return RunEntry(place, f"run_{place}", 0.0, took, status, taken=taken, **more)
+
+
+FORK = """
+[transitions.begin]
+in = ["jobs"]
+out = ["a", "b"]
+[transitions.join]
+in = ["a:normal", "b:normal"]
+out = ["end"]
+[transitions.a_lost]
+in = ["a:error"]
+out = ["end"]
+[transitions.b_lost]
+in = ["b:error"]
+out = ["end"]
+"""
+
+
+def test_side_by_side_takes_the_longer_one() -> None:
+    """Uniform on 1, 3 beside 2: the time is 2 or 3, half each."""
+    throws = [
+        Throw(1, 0.0, runs=[entry("a", took, taken="join"), entry("b", 2.0, taken="join")]) for took in (1.0, 3.0)
+    ]
+    played = play(FORK, throws)
+    assert set(played.time.tolist()) == {2.0, 3.0}
+    assert np.mean(played.time == 3.0) == pytest.approx(0.5, abs=0.05)
+    assert played.completed.all() and played.all_success.all()
+
+
+def test_what_its_runs_chose_decides_between_exits_of_one_status() -> None:
+    """Two normal exits with a condition on a variable: taken as often as they were, with the durations that went with each."""
+    text = """
+[variables.found]
+type = "bool"
+[transitions.begin]
+in = ["jobs"]
+out = ["a"]
+[transitions.yes]
+in = ["a:normal"]
+out = ["b"]
+when = "found"
+[transitions.no]
+in = ["a:normal"]
+out = ["end"]
+when = "not found"
+[transitions.lost]
+in = ["a:error"]
+out = ["end"]
+[transitions.done]
+in = ["b:normal"]
+out = ["end"]
+[transitions.b_lost]
+in = ["b:error"]
+out = ["end"]
+"""
+    yes = [
+        Throw(1, 0.0, runs=[entry("a", 1.0, taken="yes"), RunEntry("b", "run_b", 1.0, 5.0, "failure", taken="done")])
+    ]
+    no = [Throw(1, 0.0, runs=[entry("a", 2.0, taken="no")])]
+    played = play(text, yes + no * 3)
+    assert set(played.time.tolist()) == {2.0, 6.0}
+    assert np.mean(played.time == 6.0) == pytest.approx(0.25, abs=0.04)
+    assert (played.all_success == (played.time == 2.0)).all()
+
+
+def test_a_loop_is_geometric() -> None:
+    """Tried again with probability 1/2 each time: mean number of runs 2."""
+    text = """
+[transitions.begin]
+in = ["jobs"]
+out = ["a"]
+[transitions.done]
+in = ["a:normal"]
+out = ["end"]
+[transitions.again]
+in = ["a:error"]
+out = ["a"]
+[transitions.b_done]
+in = ["b:normal"]
+out = ["end"]
+[transitions.b_lost]
+in = ["b:error"]
+out = ["end"]
+"""
+    throws = [
+        Throw(1, 0.0, runs=[entry("a", 1.0, taken="done")]),
+        Throw(1, 0.0, runs=[entry("a", 1.0, "error", "again")]),
+    ]
+    played = play(text, throws, 5000)
+    assert played.time.mean() == pytest.approx(2.0, abs=0.08)
+    assert np.mean(played.time == 1.0) == pytest.approx(0.5, abs=0.03)
+
+
+def test_timers_and_events_race() -> None:
+    """An event at 1 or 3 s against a timer of 2 s: half each; a timer that was never seen to fire counts as it is declared."""
+    text = """
+[events.bell]
+scope = "external"
+memory = "pulse"
+[transitions.rung]
+in = ["jobs"]
+out = ["a"]
+event = "bell"
+[transitions.tired]
+in = ["jobs"]
+out = ["end"]
+after = 2.0
+[transitions.done]
+in = ["a:normal"]
+out = ["end"]
+[transitions.lost]
+in = ["a:error"]
+out = ["end"]
+[transitions.b_done]
+in = ["b:normal"]
+out = ["end"]
+[transitions.b_lost]
+in = ["b:error"]
+out = ["end"]
+"""
+    throws = [Throw(1, 0.0, runs=[entry("a", 4.0, taken="done")], waits=[("rung", wait)]) for wait in (1.0, 3.0)]
+    played = play(text, throws, task='final = "end == 1"')
+    assert set(played.time.tolist()) == {5.0, 2.0}
+    assert np.mean(played.time == 2.0) == pytest.approx(0.5, abs=0.05)
+
+
+def test_giving_up_and_dead_ends_do_not_complete() -> None:
+    """final_error, and a marking in which nothing can happen any more."""
+    text = """
+[places.broken]
+kind = "resource"
+[transitions.begin]
+in = ["jobs"]
+out = ["a"]
+[transitions.done]
+in = ["a:normal", "!broken"]
+out = ["end"]
+[transitions.lost]
+in = ["a:error"]
+out = ["broken"]
+[transitions.b_done]
+in = ["b:normal"]
+out = ["end"]
+[transitions.b_lost]
+in = ["b:error"]
+out = ["end"]
+"""
+    throws = [
+        Throw(1, 0.0, runs=[entry("a", 1.0, "error", "lost")]),
+        *[Throw(1, 0.0, runs=[entry("a", 1.0, taken="done")])] * 3,
+    ]
+    for ending in (
+        'final = "end == 1"\nfinal_error = "broken == 1"\nruns_place = "jobs"',
+        'final = "end == 1"\nruns_place = "jobs"',
+    ):
+        played = play(text, throws, task=ending)
+        assert np.mean(played.completed) == pytest.approx(0.75, abs=0.04)
+        assert np.isnan(played.time[~played.completed]).all()
+
+
+SERVERS = """
+[places.c]
+kind = "action"
+task = "a"
+servers = 2
+[transitions.c_done]
+in = ["c:normal"]
+out = ["end"]
+[transitions.c_lost]
+in = ["c:error"]
+out = ["end"]
+"""
+
+
+def test_several_servers_are_refused_with_a_remedy() -> None:
+    """Not silently wrong."""
+    with pytest.raises(ValueError, match="servers = 1"):
+        play(FORK + SERVERS, [Throw(1, 0.0, runs=[entry("a", 1.0), entry("b", 1.0)])])
+
+
+def test_choices_without_a_single_action_are_refused() -> None:
+    """A place that is entered although nothing was measured there."""
+    with pytest.raises(ValueError, match="no action has a probability"):
+        play(FORK, [Throw(1, 0.0, runs=[entry("a", 1.0)])])
