@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -86,4 +87,4 @@ def tidy(options: argparse.Namespace) -> None:
         from coordinator.runfolder import retain
 
         for name in retain(options.folder.parent, options.keep):
-            print(f"removed the run {name} (--keep {options.keep})")
+            print(f"removed the run {name} (--keep {options.keep})", file=sys.stderr)

@@ -24,12 +24,16 @@ node = "node"
 
 
 def directory_for(task: Task, extra: str = "") -> Directory:
+    """The directory of `services_text`."""
+    return parse(services_text(task) + extra, Path("services.toml"))
+
+
+def services_text(task: Task) -> str:
     """A services.toml that places the first alternative of each primitive task on one node."""
-    actions = "".join(
+    return HEAD + "".join(
         f'[actions.{p.alternatives[0]}]\nrun = "scripted:nothing"\ntask = "{p.name}"\nnode = "node"\n'
         for p in task.primitive_tasks.values()
     )
-    return parse(HEAD + actions + extra, Path("services.toml"))
 
 
 def scripts(task: Task, lines: Mapping[str, list[Line]]) -> dict[str, Callable[..., Any]]:

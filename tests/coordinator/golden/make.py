@@ -1,0 +1,68 @@
+"""Makes the golden journals anew: `python -m tests.coordinator.golden.make`. Do it only when the semantics are meant to change.
+
+Each is a mission run of a shipped task in lock step with scripted actions. The tests derive every marking and instruction of them
+again (tests/coordinator/test_golden.py), so a change that no version of petrobot may make by accident is noticed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from coordinator.cli.loading import load_task, task_path
+from coordinator.journal import JournalWriter
+from coordinator.launch import Setting, lockstep_cell, lockstep_id, with_runs
+from coordinator.recording import JournalStore
+from coordinator.runfolder import header
+from services.action import Status
+from services.comm.directory import parse
+from services.scripted import Line
+from tests.coordinator.scripted_cell import scripts, services_text
+
+FOLDER = Path(__file__).parent
+GOOD = Line(seconds=(0.2, 0.2))
+FAULT = Line(Status.ERROR, (0.1, 0.1), cause="drive_fault", text="drive 3: following error")
+MISSED = Line(Status.FAILURE, (0.3, 0.3), cause="missed")
+STORIES: Mapping[str, tuple[str, int, Mapping[str, list[Line]]]] = {
+    "catch_ball-undisturbed": ("catch_ball", 4, {}),
+    "catch_ball-missed-and-recovered": (
+        "catch_ball",
+        4,
+        {
+            "catch_ball": [MISSED, GOOD, FAULT, GOOD],
+            "move_to_point": [GOOD, FAULT, GOOD, GOOD],
+            "recover_arm": [FAULT, GOOD],
+        },
+    ),
+    "catch_ball-given-up": ("catch_ball", 2, {"return_home": [FAULT], "recover_arm": [FAULT]}),
+}
+"""Name of a journal: task, runs, and what its actions do."""
+
+
+def make(name: str, folder: Path) -> Path:
+    """Run a story; gives its journal."""
+    task_name, runs, lines = STORIES[name]
+    task, path = load_task(task_name), folder / f"{name}.journal"
+    text = services_text(task)
+    setting = Setting(task, runs=runs)
+    given = {"services_path": "services.toml", "seed": setting.seed, "runs": with_runs(task, runs)[1]}
+    source = task_path(task_name).read_text(encoding="utf-8")
+    parameters = {"parameters": dict(task.parameters), "cell": "launched", "mock": "", "durable": False}
+    first = header(lockstep_id(setting), source, text, "lockstep", {**given, **parameters})
+    store = JournalStore(JournalWriter(path, first), 0.0)
+    cell, party = lockstep_cell(parse(text, Path("services.toml")), setting, scripts(task, lines), store=store)
+    if not cell.run(lambda: party.over, 1_000_000):
+        raise RuntimeError(f"{name} does not end")
+    store.writer.close()
+    return path
+
+
+def main() -> None:
+    """All of them."""
+    for name in STORIES:
+        (FOLDER / f"{name}.journal").unlink(missing_ok=True)
+        print(make(name, FOLDER))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,66 @@
+"""Two coordinators want one device: its lease settles who has it, the second is refused in clear and nothing moves for it."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+
+from coordinator.cli.loading import load_task
+from coordinator.launch import Setting, local_programs, mission_id, realtime_mission
+from coordinator.mission import Mission
+from coordinator.realtime import RealtimeMission
+from coordinator.supervisor import Supervisor
+from coordinator.task import Executed, Status
+from services.comm.directory import Directory, load
+from tests.chaos.shuttle_cell import TASK, moves, shuttle_services
+
+pytestmark = pytest.mark.processes
+LIMIT = 120.0
+
+
+def mission_on(directory: Directory, runs: int) -> Mission:
+    """A mission run that has not begun."""
+    task = load_task(str(TASK))
+    return realtime_mission(directory, Setting(task, runs=runs), mission_id(task))
+
+
+async def led(directory: Directory, mission: Mission, meanwhile: asyncio.Event | None = None) -> None:
+    """Connect, set `meanwhile`, run to the end, leave in good order."""
+    shell = RealtimeMission(mission, directory)
+    try:
+        await shell.connect(30.0)
+        if meanwhile is not None:
+            meanwhile.set()
+        await asyncio.wait_for(shell.run(), LIMIT)
+    finally:
+        await shell.close()
+
+
+async def until_moving(folder: Path) -> None:
+    """Until a move has begun."""
+    async with asyncio.timeout(LIMIT):
+        while not moves(folder, "begin"):
+            await asyncio.sleep(0.005)
+
+
+async def test_the_second_coordinator_is_refused_until_the_first_has_gone(tmp_path: Path) -> None:
+    """No device is shared, no run of the first one suffers, and whoever comes after it has the hands at once."""
+    directory = load(shuttle_services(tmp_path, fetch=0.8, carry=0.8))
+    first, second, third = (mission_on(directory, runs) for runs in (6, 2, 2))
+    async with Supervisor(local_programs(directory), tmp_path / "logs"):
+        leading = asyncio.create_task(led(directory, first))
+        await until_moving(tmp_path)
+        await led(directory, second)
+        assert first.executor.finished is None, "the first one still goes on"
+        await leading
+        await led(directory, third)
+    refused = second.tally.runs
+    assert {(r.status, r.cause, r.executed) for r in refused} == {(Status.ERROR, "device_leased", Executed.NO)}
+    assert all(first.executor.mission in r.text for r in refused), "the text says who has it"
+    for mission in (first, third):
+        assert all(r.status is Status.SUCCESS for r in mission.tally.runs)
+    begun = moves(tmp_path, "begin")
+    assert set(begun.values()) == {1} and not moves(tmp_path, "overlap")
+    assert not any(call.startswith(second.executor.mission) for call in begun)
