@@ -30,20 +30,22 @@ class Table:
         """Cut off what an interruption left of a block; gives how many blocks are complete. Raises CampaignError."""
         if not self.path.exists():
             return 0
-        text = self.path.read_bytes()
-        ends = _record_ends(text)
-        if not ends:
+        ends = _record_ends(self.path)
+        header = next(ends, None)
+        if header is None:
             self.path.unlink()
             return 0
-        self._columns = next(csv.reader(io.StringIO(text[: ends[0]].decode("utf-8"))))
-        throws, done, end = len(ends) - 1, 0, ends[0]
+        done, end, throws = 0, header, 0
         for block in blocks:
-            if block.first + block.count > throws:
+            last = None
+            while throws < block.first + block.count and (last := next(ends, None)) is not None:
+                throws += 1
+            if last is None:
                 break
-            done, end = done + 1, ends[block.first + block.count]
-        if end < len(text):
-            with self.path.open("r+b") as file:
-                file.truncate(end)
+            done, end = done + 1, last
+        with self.path.open("r+b") as file:
+            self._columns = next(csv.reader(io.StringIO(file.read(header).decode("utf-8"))))
+            file.truncate(end)
         return done
 
     def append(self, rows: Sequence[Row]) -> None:
@@ -79,15 +81,15 @@ def read_table(path: Path) -> Iterator[Row]:
         raise CampaignError(f"{path}: {fault.strerror or fault}") from fault
 
 
-def _record_ends(text: bytes) -> list[int]:
+def _record_ends(path: Path) -> Iterator[int]:
     """Where each complete record ends: after a newline that stands outside quotes."""
-    ends, quoted, start = [], False, 0
-    while (at := text.find(b"\n", start)) >= 0:
-        quoted ^= text.count(b'"', start, at) % 2 == 1
-        start = at + 1
-        if not quoted:
-            ends.append(start)
-    return ends
+    quoted, end = False, 0
+    with path.open("rb") as file:
+        for line in file:
+            end += len(line)
+            quoted ^= line.count(b'"') % 2 == 1
+            if not quoted and line.endswith(b"\n"):
+                yield end
 
 
 def write_parquet(folder: Path) -> Path | None:

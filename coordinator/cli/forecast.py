@@ -177,6 +177,7 @@ def compared(registered: Path, folder: Path) -> dict[str, Any]:
         "forecast": {"file": registered.name, "sha256": forecast["sha256"], "registered_at": forecast["registered_at"]},
         "campaign": {"folder": folder.name, "seed": plan.seed, "began_at": first},
         "registered_before": first is not None and forecast["registered_at"] <= first,
+        "same_block": training.get("block") in (None, plan.block),
         "same_task_file": forecast.get("task_sha256") in (None, plan.digests["task"]),
         **found,
     }

@@ -117,6 +117,8 @@ def agreement_text(found: Mapping[str, Any]) -> str:
     lines += [
         f"ways out of {row['place']} differ, regime {row['regime'] or '-'}: p = {row['p_holm']:.1e}" for row in odd
     ]
+    if not found["same_block"]:
+        lines.append("note: the training had another --block: the first throws of a cell are a different share of all")
     if not found["same_task_file"]:
         lines.append("note: the task file has changed between training and these runs")
     lines.append("agrees" if found["agrees"] else "DISAGREES: at least one figure at 1 % after Holm")
