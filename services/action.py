@@ -88,7 +88,8 @@ class Context(Protocol):
 
     @property
     def now(self) -> float:
-        """The cell's clock: simulated time in lock step, monotonic time otherwise (s)."""
+        """The cell's clock: simulated time in lock step, monotonic time otherwise (s). It stands still while the operator holds
+        the run, so what is left of a timeout stays left."""
 
     @property
     def run(self) -> str:

@@ -39,6 +39,8 @@ class RunContext:
         outlets: Outlets,
         report: Callable[[Report], None],
     ) -> None:
+        self.held = 0.0
+        """Seconds for which the operator has held the run."""
         self._begin = begin
         self._device = device
         self._clock = clock
@@ -51,8 +53,8 @@ class RunContext:
 
     @property
     def now(self) -> float:
-        """The cell's clock (s)."""
-        return self._clock()
+        """The cell's clock, without the time for which the run was held (s)."""
+        return self._clock() - self.held
 
     @property
     def run(self) -> str:
@@ -66,15 +68,15 @@ class RunContext:
 
     def wait(self, ready: Callable[[], bool], timeout: float | None = None) -> Wait:
         """Awaitable: True as soon as `ready()` holds, False after `timeout` seconds."""
-        return Wait(ready, None if timeout is None else self.now + timeout)
+        return Wait(ready, None if timeout is None else self._clock() + timeout)
 
     def sleep(self, seconds: float) -> Wait:
         """Awaitable: goes on after so many seconds of the cell's clock."""
-        return Wait(never, self.now + seconds)
+        return Wait(never, self._clock() + seconds)
 
     def publish(self, stream: str, values: Sequence[float]) -> None:
         """Make `values` the newest set point of a stream; repeated while the run goes on and stands by it."""
-        self._outlets.publish(self.now, self.run, stream, values)
+        self._outlets.publish(self._clock(), self.run, stream, values)
 
     def withdraw(self, stream: str) -> None:
         """Stop standing by the last set point of a stream."""

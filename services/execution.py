@@ -153,6 +153,8 @@ class Execution:
         self.started += pause
         self.ready_at += pause
         self.limit = None if self.limit is None else self.limit + pause
+        if self.context is not None:
+            self.context.held += pause
         if self.wait is not None and self.wait.due is not None:
             self.wait.due += pause
 

@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from services.action import Status
+from services.action import Status, success
+from services.comm.directory import ActionEntry
 from services.comm.messages import Executed
 from services.device import stop_at_once
 from services.remote import (
@@ -159,8 +160,6 @@ def test_a_hold_without_runs_stays_until_it_is_released() -> None:
 
 def test_a_cancelled_run_of_a_held_device_calls_its_stop_routine() -> None:
     """Held, the device looks as if it stood; released without having been stopped it would go on without its run."""
-    from services.comm.directory import ActionEntry
-
     clock = Clock()
     device = Device(clock, halting=0.0)
 
@@ -182,3 +181,36 @@ def test_a_cancelled_run_of_a_held_device_calls_its_stop_routine() -> None:
         assert len(device.stops) == stops
         (end,) = [report for report in runner.reports() if isinstance(report, Ended)]
         assert end.cause == "cancelled"
+
+
+def test_a_held_run_does_not_grow_older() -> None:
+    """Its clock, its waits and its deadline stand still: an action that looks at `ctx.now` is not late after a pause."""
+    clock = Clock()
+    seen: list[float] = []
+
+    async def patient(ctx: Any) -> Any:
+        until = ctx.now + 1.0
+        while ctx.now < until:
+            await ctx.sleep(0.1)
+            seen.append(ctx.now)
+        return success(left=until - ctx.now)
+
+    entries = {"patient": ActionEntry("patient", "tests:none", "task", "here")}
+    runner = Runner(entries, clock=clock, substitutes={"patient": patient}, virtual=True)
+    runner.take(clock.now, Begin("r", "patient", {}, 2.0, 1))
+
+    def go_on(seconds: float) -> list[Any]:
+        until, told = clock.now + seconds, []
+        while clock.now < until - 1e-9:
+            runner.advance(clock.now)
+            told += runner.reports()
+            clock.now += 0.004
+        return told
+
+    assert go_on(0.55) == []
+    runner.take(clock.now, Hold(True))
+    assert go_on(30.0) == []
+    runner.take(clock.now, Hold(False))
+    (end,) = go_on(0.7)
+    assert isinstance(end, Ended) and end.status is Status.SUCCESS
+    assert end.seconds == pytest.approx(1.0, abs=0.15) and seen[-1] < 1.2
