@@ -30,7 +30,7 @@ from sim.track_truth import RoverTruth, TrackSite, TrackTruth, track_site_of
 
 REGIME: Final = "straight"
 """The regime if none is asked for."""
-_SLIP, _LIGHT, _IMAGE, _ECHO, _FAULTS = 0x736C, 0x6C69, 0x696D, 0x6563, 0x6661
+_SLIP, _LIGHT, _IMAGE, _ECHO, _FAULTS, _FALLEN = 0x736C, 0x6C69, 0x696D, 0x6563, 0x6661, 0x6672
 """Keep draws of the same seed apart."""
 
 
@@ -68,14 +68,15 @@ class TrackLaboratory(LaboratoryParty):
         self._hall = Hall(truth.light, np.random.default_rng((seed, _LIGHT)), self.now)
         self._image_draws = np.random.default_rng((seed, _IMAGE))
         self._echo_draws = np.random.default_rng((seed, _ECHO))
-        self._reflectors = [(gap.x, gap.y) for gap in track.gaps]
+        hangs = np.random.default_rng((seed, _FALLEN)).random(len(track.gaps)) >= truth.reflector_missing
+        self._reflectors = [(gap.x, gap.y) for gap, there in zip(track.gaps, hangs, strict=True) if there]
         self._faults = FaultPlan(np.random.default_rng((seed, _FAULTS)))
         self.bus.power(True)
         self.bus.sensor.dead = False
         self.rover.move_to(self.now)
         draws = np.random.default_rng((seed, _SLIP))
         self.rover.place(truth.rover, _put_down(track.start, truth.rover, draws), draws)
-        self.referee = Referee(track, seed, truth.regime, self.now)
+        self.referee = Referee(track, seed, truth.regime, self.now, hangs.tolist())
         self._watch_due = self.now
 
     def _camera_of(self, truth: TrackTruth) -> FloorCamera:

@@ -42,7 +42,7 @@ def floor_plan(scores: Sequence[Mapping[str, Any]], names: Sequence[str] = (), *
         *_squares(left, bottom, right, top),
         "</g>",
         *_paint(track),
-        *_reflectors(track),
+        *_reflectors(track, scores[0]),
     ]
     for number, score in enumerate(scores):
         parts += _path(score, number)
@@ -118,12 +118,16 @@ def _line(element: Element, way: float) -> str:
     return f"M{x0:.5g} {y0:.5g}A{RADIUS:g} {RADIUS:g} 0 0 {sweep} {x1:.5g} {y1:.5g}"
 
 
-def _reflectors(track: Track) -> list[str]:
-    return [
-        f'<g><circle cx="{gap.x:.4g}" cy="{gap.y:.4g}" r="0.11" fill="#ffd43b" stroke="#e67700" stroke-width="0.04"/>'
-        "<title>retroreflector: the track resumes here</title></g>"
-        for gap in track.gaps
-    ]
+def _reflectors(track: Track, score: Mapping[str, Any]) -> list[str]:
+    """A disc for each that hangs, a ring for each that has fallen."""
+    parts = []
+    for gap, crossing in zip(track.gaps, score["crossings"], strict=True):
+        fill, what = ("#ffd43b", "hangs") if crossing["reflector"] else ("none", "has fallen")
+        parts.append(
+            f'<g><circle cx="{gap.x:.4g}" cy="{gap.y:.4g}" r="0.11" fill="{fill}" stroke="#e67700" stroke-width="0.04"/>'
+            f"<title>the track resumes here; its retroreflector {what}</title></g>"
+        )
+    return parts
 
 
 def _points(score: Mapping[str, Any]) -> list[tuple[float, float]]:

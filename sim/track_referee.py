@@ -8,6 +8,7 @@ track, until it is back on a painted element no farther back than it was; and at
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Final
@@ -52,6 +53,7 @@ class _Crossing:
 
     gap: Gap
     kind: str
+    reflector: bool
     entered: float | None = None
     ended: float | None = None
     recovered: bool = False
@@ -66,6 +68,8 @@ class Referee:
     seed: int
     regime: str
     began: float
+    reflectors: Sequence[bool] = ()
+    """Whether the reflector of each interruption hangs; all do if nothing is said."""
     phase: Phase = Phase.ON
     s: float = 0.0
     """Arc length reached (m)."""
@@ -88,7 +92,11 @@ class Referee:
 
     def __post_init__(self) -> None:
         kinds = [element.kind for element in self.track.elements if not element.painted]
-        self._crossings = [_Crossing(gap, kind.name.lower()) for gap, kind in zip(self.track.gaps, kinds, strict=True)]
+        hang = self.reflectors or [True] * len(kinds)
+        self._crossings = [
+            _Crossing(gap, kind.name.lower(), there)
+            for gap, kind, there in zip(self.track.gaps, kinds, hang, strict=True)
+        ]
 
     def watch(self, now: float, pose: Pose, speed: float) -> bool:
         """The body is at `pose` and goes at `speed` (m/s) at a moment (s). Says whether the rover has just left the board, where
@@ -230,6 +238,7 @@ class Referee:
         return {
             "kind": crossing.kind,
             "s": round(crossing.gap.start, 3),
+            "reflector": crossing.reflector,
             "recovered": crossing.recovered,
             "entered_after": None if entered is None else round(entered - begun, 3),
             "took_s": None if entered is None or ended is None else round(ended - entered, 3),

@@ -115,6 +115,8 @@ class TrackTruth:
     camera: Mount
     sensor: SensorTruth
     light: LightTruth
+    reflector_missing: float
+    """Probability that a reflector has fallen down."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,6 +140,7 @@ class TrackSite:
                 _camera(nominal["camera"], errors, values, rng),
                 _sensor(nominal, self.settings["sensor"], errors, values, rng),
                 _light(values),
+                float(values["reflector_missing"]),
             )
         except KeyError as fault:
             raise LaboratoryError(

@@ -82,6 +82,19 @@ def test_the_reflectors_in_view_are_told(rover_bench: Bench) -> None:
     assert distance == pytest.approx(math.hypot(ahead, aside, 0.3), abs=0.04)
 
 
+def test_reflectors_that_have_fallen_give_no_echo(rover_bench: Bench) -> None:
+    bench = rover_bench()
+    there = []
+    for seed in range(60):
+        bench.call("laboratory_prepare", seed=seed, regime="arcs+fallen")
+        crossings = bench.call("laboratory_score").values["crossings"]
+        there += [each["reflector"] for each in crossings]
+        assert len(bench.lab._reflectors) == sum(each["reflector"] for each in crossings)
+    assert sum(there) / len(there) == pytest.approx(0.3, abs=0.12)
+    bench.call("laboratory_prepare", seed=1, regime="arcs")
+    assert all(each["reflector"] for each in bench.call("laboratory_score").values["crossings"])
+
+
 # Images
 
 
