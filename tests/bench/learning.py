@@ -178,14 +178,12 @@ def _draw_regret(found: dict[str, dict[str, dict[str, Any]]]) -> None:
     from matplotlib import pyplot as plt
 
     figure, axes = plt.subplots(2, 2, figsize=(10, 7))
-    shown = [n for n in found if n != "fixed"]
+    shown = [n for n in found if n not in ("fixed", "round_robin")]
     for ax, world in zip(axes.flat, ("easy", "middle", "hard", "changing"), strict=True):
         for i, name in enumerate(shown):
             style = "--" if name not in RULES else "-"
             ax.plot(MARKS, found[name][world]["curve"], style, color=f"C{i % 10}", label=name, lw=1.2)
-        ax.set(
-            title=f"{world}: gap {WORLDS[world].gap:.2g}", xlabel="trial", ylabel="cumulative regret (J)", xscale="log"
-        )
+        ax.set(title=f"{world}: gap {WORLDS[world].gap:.2g}", xlabel="trial", ylabel="cumulative regret (J)")
     axes[0, 0].legend(fontsize=7)
     _save(figure, "learning-regret.svg")
 
