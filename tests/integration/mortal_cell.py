@@ -36,6 +36,8 @@ from services.comm.lockstep import Member
 CELL = "cell"
 TASK = "catch_ball"
 SURVIVOR = 10**9
+PATIENCE = 120.0
+"""Seconds for a tick: the laboratory prepares an experiment between two of them, on a machine that may be busy."""
 
 
 class MortalStore(JournalStore):
@@ -118,8 +120,11 @@ class Experiment:
             killed = os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL
             if not killed:
                 break
-        assert os.waitpid(cell, 0)[1] == 0, "the cell's process failed"
+        if status:
+            os.kill(cell, signal.SIGKILL)
+        survived = os.waitpid(cell, 0)[1]
         assert status == 0, f"the coordinator's process failed: {status}"
+        assert survived == 0, "the cell's process failed"
         return {
             "kills": list(kills),
             "lives": life + 1,
@@ -129,9 +134,8 @@ class Experiment:
 
     def _member(self, name: str, parties: Sequence[Any], **more: Any) -> Member:
         delays = Delays(self.directory.delays())
-        return Member(
-            name, parties, self._addresses, hosts=self._hosts, delays=delays, directory=self.directory.hash, **more
-        )
+        settings = {"hosts": self._hosts, "delays": delays, "directory": self.directory.hash, "patience": PATIENCE}
+        return Member(name, parties, self._addresses, **settings, **more)
 
     def _cell(self) -> None:
         counted = counting(self.directory, self._log)
