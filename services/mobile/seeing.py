@@ -82,10 +82,9 @@ async def _find(ctx: Context, detector: Detector, timeout: float, image_timeout:
                 return sight
             row = row + 1 if sight.seen else 0
             if row == CONFIRMED:
-                line = sight.describe()
-                return success(
-                    images=watcher.images, offset=line.offset, heading=line.heading, curvature=line.curvature
-                )
+                shape = sight.describe()
+                values = {"offset": shape.offset, "heading": shape.heading, "curvature": shape.curvature}
+                return success(images=watcher.images, **values)
     except Cancelled:
         ctx.withdraw(STREAM)
         raise

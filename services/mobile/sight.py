@@ -61,15 +61,42 @@ class Sight:
         """Whether there is a line."""
         return self.x.size > 2
 
-    def describe(self) -> Line:
-        """Offset, heading and curvature over the first half metre. Raises ValueError when no line was seen."""
+    def line(self) -> Line:
+        """A parabola over the first half metre, to know where to look next. Raises ValueError when no line was seen."""
+        x, y = self._near()
+        return fit_line(x, y)
+
+    def describe(self) -> Shape:
+        """Offset, heading and curvature at the nearest point. Raises ValueError when no line was seen.
+
+        The parabola is fitted along the chord: against the body's axis an arc seen at 60 degrees is none.
+        """
+        x, y = self._near()
+        chord = math.atan2(float(y[-1] - y[0]), float(x[-1] - x[0]))
+        cos, sin = math.cos(chord), math.sin(chord)
+        along = fit_line((x - x[0]) * cos + (y - y[0]) * sin, (y - y[0]) * cos - (x - x[0]) * sin)
+        steep = 1.0 + along.slope * along.slope
+        offset = float(y[0]) + along.offset / max(0.2, math.cos(chord))
+        return Shape(float(x[0]), offset, chord + math.atan(along.slope), along.bend / (steep * math.sqrt(steep)))
+
+    def _near(self) -> tuple[Vector, Vector]:
         if not self.seen:
             raise ValueError("no line was seen")
         near = self.x <= self.x[0] + FIT_REACH
-        return fit_line(self.x[near], self.y[near])
+        return self.x[near], self.y[near]
 
 
 UNSEEN = Sight(np.empty(0), np.empty(0))
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """The line at its nearest point, `near` m ahead: offset (m) and heading (rad) to the left, curvature (1/m, bending left)."""
+
+    near: float
+    offset: float
+    heading: float
+    curvature: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,17 +108,6 @@ class Line:
     offset: float
     slope: float
     bend: float
-
-    @property
-    def heading(self) -> float:
-        """Direction at `near` (rad from straight ahead, to the left positive)."""
-        return math.atan(self.slope)
-
-    @property
-    def curvature(self) -> float:
-        """At `near` (1/m, to the left positive)."""
-        steep = 1.0 + self.slope * self.slope
-        return self.bend / (steep * math.sqrt(steep))
 
     def at(self, x: float) -> float:
         """y at a distance x (m)."""

@@ -88,7 +88,7 @@ class LineWatcher:
                 self._expected = None
             return UNSEEN
         self.seen, self.unseen = self.seen + 1, 0
-        self._expected = sight.describe()
+        self._expected = sight.line()
         return replace(sight, end=self._believed(image, sight))
 
     @property
