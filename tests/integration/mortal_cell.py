@@ -134,7 +134,12 @@ class Experiment:
 
     def _member(self, name: str, parties: Sequence[Any], **more: Any) -> Member:
         delays = Delays(self.directory.delays())
-        settings = {"hosts": self._hosts, "delays": delays, "directory": self.directory.hash, "patience": PATIENCE}
+        settings: dict[str, Any] = {
+            "hosts": self._hosts,
+            "delays": delays,
+            "directory": self.directory.hash,
+            "patience": PATIENCE,
+        }
         return Member(name, parties, self._addresses, **settings, **more)
 
     def _cell(self) -> None:
