@@ -18,6 +18,8 @@ RETIRES_AFTER = 40
 TRIES = 3
 """Workers that a block may take with it before it counts as the block's fault."""
 LONGEST_LINE = 1 << 26
+ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1")
+"""Workers share the cores among themselves; threads of libraries would only get in their way."""
 
 
 class WorkerLost(Exception):  # noqa: N818 - what happened
@@ -36,11 +38,7 @@ class _Worker:
         """Launch a process and tell it the plan; what it says beside its answers goes to `log`."""
         pipe = asyncio.subprocess.PIPE
         command = (sys.executable, "-m", "coordinator.campaign.worker")
-        environment = {
-            **os.environ,
-            "PYTHONPATH": os.pathsep.join(p for p in sys.path if p),
-            "OPENBLAS_NUM_THREADS": "1",
-        }
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p), **ONE_THREAD}
         with log.open("ab") as said:
             process = await asyncio.create_subprocess_exec(
                 *command,
