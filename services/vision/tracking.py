@@ -85,6 +85,8 @@ class _Chase:
         self._window = Window(camera.view)
         self._exit: Exit | None = None
         self._made: list[tuple[float, float, float]] = []
+        self._latencies: list[float] = []
+        """s from the middle of an exposure to the set point that it led to."""
         self._images = self._seen = self._misses = self._otherwise = 0
         self._seen_at = 0.0
 
@@ -167,6 +169,7 @@ class _Chase:
             if exit_ is not None:
                 self._exit = exit_
                 self._made.append((self._ctx.now, exit_.time, float(exit_.point[1])))
+                self._latencies.append(self._ctx.now - time)
             return None
         self._otherwise += 1
         if self._otherwise < OTHERWISE:
@@ -212,6 +215,9 @@ class _Chase:
     def _values(self) -> dict[str, Any]:
         """What every result tells."""
         values: dict[str, Any] = {"images": self._images, "seen": self._seen}
+        if self._latencies:
+            values["latency"] = float(np.mean(self._latencies))
+            values["latency_longest"] = max(self._latencies)
         if self._exit is not None and np.isfinite(self._exit.time):
             values["exit"] = {
                 "way": str(self._exit.way),
