@@ -67,3 +67,8 @@ def note(log: str, what: str, run: str) -> None:
     file = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
     os.write(file, f"{what} {run}\n".encode())
     os.close(file)
+
+
+async def nothing(ctx: Context) -> Result:
+    """End at once: what is left is what everything around it costs."""
+    return success()
