@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from services.comm.capture import CaptureImages
 from services.comm.image import Image, ImageSource
+from services.comm.security import is_loopback
 
 Clock = Callable[[], float]
 Pixels = NDArray[np.uint8]
@@ -30,6 +31,10 @@ IMAGE_MAGIC, CONTROL_MAGIC = b"PIMG", b"PCTL"
 LARGEST_IMAGE = 16 * 1024 * 1024
 BUFFER = 4 * 1024 * 1024
 CHUNK = 1 << 20
+RECEIVERS = 16
+"""Receivers at a time; above it one that wants no images gives way."""
+ADMITTED = 4
+"""Connections taken in a poll: strangers must not hold up the loop that polls."""
 RETRY = 0.5
 """s between attempts to reach a camera that is away."""
 IN_PROGRESS = (errno.EINPROGRESS, errno.EALREADY, errno.EWOULDBLOCK, errno.EAGAIN)
@@ -206,7 +211,10 @@ class ImageServer:
     """The camera's end of the wire, for the simulated camera. Nothing blocks: a slow receiver misses images, no one waits."""
 
     def __init__(self, host: str, port: int) -> None:
-        """Bind; port 0 takes a free one. Raises OSError when the address is taken."""
+        """Bind; port 0 takes a free one. Raises OSError when the address is taken, ValueError for one that other hosts reach:
+        images have neither secrecy nor authentication."""
+        if not is_loopback(host):
+            raise ValueError(f'address "{host}:{port}" leaves this host, and images are not protected: use 127.0.0.1')
         self._listener = socket.create_server((host, port))
         self._listener.setblocking(False)
         self._receivers: list[_Receiver] = []
@@ -225,8 +233,10 @@ class ImageServer:
     def poll(self) -> None:
         """Take new receivers and controls, and go on writing. Call it often."""
         with contextlib.suppress(BlockingIOError):
-            while True:
+            for _ in range(ADMITTED):
                 link, _ = self._listener.accept()
+                if len(self._receivers) >= RECEIVERS:
+                    self._leave(next((one for one in self._receivers if one.rate <= 0.0), self._receivers[0]))
                 link.setblocking(False)
                 link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER)

@@ -14,6 +14,8 @@ from typing import Final
 from services.comm.can_stream import ERROR, EXTENDED, REMOTE, Line, encode, parse_channel
 from services.comm.canbus import CanBus, Frame
 
+PORTS: Final = 64
+"""Ports that other processes may have at a time: a bus has few, and `select` cannot wait for more than a thousand."""
 _UNSEEN: Final = EXTENDED | REMOTE | ERROR
 """Flags of frames that a `CanBus` does not carry."""
 
@@ -95,6 +97,11 @@ class Hub:
     def _accept(self) -> None:
         with contextlib.suppress(BlockingIOError):
             sock, _ = self._listener.accept()
+            if len(self._lines) >= PORTS:
+                self.dropped.append(f"more than {PORTS} ports")
+                del self.dropped[:-20]
+                sock.close()
+                return
             try:
                 self._lines[sock.fileno()] = Line(sock)
             except ConnectionError:

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from coordinator.certificates import make_certificates
 from services.comm.caller import Caller
+from services.comm.camera import ImageServer, StreamImages
+from services.comm.can_hub import Hub
+from services.comm.can_ports import StreamPort
+from services.comm.canbus import Frame
 from services.comm.client import Client
 from services.comm.credentials import credentials
 from services.comm.messages import Hello
@@ -124,3 +130,59 @@ def test_strangers_do_not_hold_up_the_loop_that_polls() -> None:
         one.close()
     good.close()
     receiver.close()
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "192.168.7.2", "::"])
+def test_unprotected_streams_stay_on_this_host(host: str) -> None:
+    """Images and CAN frames between processes have neither secrecy nor authentication: no other host may reach them."""
+    with pytest.raises(ValueError, match="images are not protected"):
+        ImageServer(host, 0)
+    with pytest.raises(ValueError, match="the stream is not protected"):
+        Hub(f"tcp://[{host}]:0" if ":" in host else f"tcp://{host}:0")
+
+
+def test_a_crowd_at_the_camera_leaves_the_good_receiver_its_images() -> None:
+    """Receivers are bounded; who wants images stays."""
+    camera = ImageServer("127.0.0.1", 0)
+    good = StreamImages("127.0.0.1", camera.port, time.monotonic)
+    good.start(50.0)
+    while camera.rate < 50.0:
+        good.newest()
+        camera.poll()
+    crowd = [socket.create_connection(("127.0.0.1", camera.port)) for _ in range(60)]
+    for _ in range(40):
+        camera.poll()
+        assert len(camera._receivers) <= 16
+    pixels = np.zeros((4, 6), np.uint8)
+    seen = None
+    while seen is None:
+        camera.send(pixels, 0.0)
+        camera.poll()
+        seen = good.newest()
+    assert seen.pixels.shape == (4, 6)
+    for one in crowd:
+        one.close()
+    good.close()
+    camera.close()
+
+
+def test_a_crowd_at_the_simulated_bus_leaves_the_good_ports_their_frames() -> None:
+    """Ports are bounded; those that are there go on."""
+    hub = Hub()
+    near, far = hub.port(), StreamPort(hub.channel)
+    hub.poll(1.0)
+    address = ("127.0.0.1", int(hub.channel.rpartition(":")[2]))
+    crowd = [socket.create_connection(address) for _ in range(100)]
+    while hub.ports < 64 or len(hub.dropped) < 20:
+        hub.poll(0.1)
+    assert hub.ports == 64
+    far.send(Frame(0x123, b"ab"))
+    got: list[Frame] = []
+    while not got:
+        hub.poll(0.1)
+        got += near.receive()
+    assert got == [Frame(0x123, b"ab")]
+    for one in crowd:
+        one.close()
+    far.close()
+    hub.close()
