@@ -1,4 +1,4 @@
-"""Print a recorded run for people, or export it: JSON lines, XES for process mining."""
+"""Print a recorded run for people, or export it: JSON lines, XES for process mining, MCAP for Foxglove."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument("run", help="a run's id or folder, or `last`")
     parser.add_argument("--format", choices=("text", "jsonl", "xes"), default="text", help="default: %(default)s")
+    parser.add_argument("--mcap", metavar="FILE", type=Path, help="write it as MCAP instead (needs the package mcap)")
     parser.add_argument("--out", metavar="FILE", default="-", help="where to write it (default: standard output)")
 
 
@@ -26,14 +27,27 @@ def run(options: argparse.Namespace) -> int:
 
     found = recorded(options.run)
     try:
+        if options.mcap is not None:
+            _write_mcap(options.mcap, found)
+            return 0
         _write(options.out, _text(found) if options.format == "text" else _exported(options.format, found))
     except JournalError as fault:
         raise CommandError(2, str(fault)) from fault
     except ReplayError as fault:
         raise CommandError(1, str(fault)) from fault
     except OSError as fault:
-        raise CommandError(2, f"{options.out}: {fault.strerror or fault}") from fault
+        raise CommandError(2, f"{options.mcap or options.out}: {fault.strerror or fault}") from fault
     return 0
+
+
+def _write_mcap(path: Path, found: Recorded) -> None:
+    from coordinator.mcap_export import McapMissingError, write_mcap
+
+    try:
+        count = write_mcap(path, found.journal, found.engine.compiled.net, found.steps())
+    except McapMissingError as fault:
+        raise CommandError(2, str(fault)) from fault
+    print(f"{path}: {count} messages")
 
 
 def _exported(form: str, found: Recorded) -> Iterator[str]:

@@ -106,7 +106,8 @@ class Callee:
         refusal = self._peers.refusal(peer, hello)
         if refusal is not None:
             return refusal
-        self._peers.come(peer, hello, local)
+        forgotten = self._peers.come(peer, hello, local)
+        self.events.peer_down(forgotten, leaves=True)
         self._messages.extend((peer, event) for event in self.events.waiting(peer))
         version = negotiate(hello.oldest_version, hello.newest_version) or NEWEST_VERSION
         offers = tuple(name for name, offer in self.offers.items() if local or offer.scope != "local")

@@ -66,14 +66,16 @@ class Peers:
             return Refuse("directory", f"{text}: copy the same file to each host and start its node again")
         return None
 
-    def come(self, name: str, hello: Hello, local: bool) -> None:
-        """A caller is welcome; the oldest of too many that are away is forgotten."""
+    def come(self, name: str, hello: Hello, local: bool) -> str:
+        """A caller is welcome. Gives the name of the oldest of too many that are away, which is forgotten; else empty."""
         self._peers.pop(name, None)
         self._peers[name] = Peer(hello.role, hello.boot, hello.epoch, local)
         if len(self._peers) > KNOWN:
             away = next((other for other, peer in self._peers.items() if not peer.up), None)
             if away is not None:
                 del self._peers[away]
+                return away
+        return ""
 
     def go(self, now: float, name: str, leaves: bool) -> bool:
         """A caller's link is down; with `leaves` it gives up its leases. Says whether it was up."""

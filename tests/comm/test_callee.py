@@ -326,14 +326,16 @@ def test_a_service_answered_on_the_spot_is_answered_once_by_either_way() -> None
     assert _said(callee) == [outcome]
 
 
-def test_callers_that_came_and_went_do_not_fill_the_memory() -> None:
+@pytest.mark.parametrize("role", ["client", "coordinator"])
+def test_callers_that_came_and_went_do_not_fill_the_memory(role: str) -> None:
+    """Also coordinators that died without a word, whose subscriptions outlive their links."""
     callee = Callee("motion", "n1", OFFERS)
     for n in range(2_000):
         name = f"client{n}"
-        assert isinstance(callee.link_up(0.0, name, m.Hello(1, 1, "client", name, "b")), m.Welcome)
+        assert isinstance(callee.link_up(0.0, name, m.Hello(1, 1, role, name, "b")), m.Welcome)
         callee.receive(0.0, name, m.Subscribe(("tick",)))
         callee.link_down(0.0, name)
-    assert len(callee._peers._peers) <= 257
+    assert len(callee._peers._peers) <= 257 and len(callee.events._listeners) <= 257
     assert callee.events.raise_event(m.Event("tick", "timer", 0), False, "")[1] == []
 
 

@@ -1,0 +1,96 @@
+"""A journal as an MCAP file (mcap.dev), to be looked at in Foxglove beside other recordings. Needs the package `mcap`.
+
+One channel each for markings, firings, runs and reports, as JSON messages with a schema; a message's time is that of its stimulus,
+counted from the date in the journal's header.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Final
+
+from coordinator.engine import Fired, Instruction, Report, RunRecorded, StartRun
+from coordinator.journal import Journal
+from coordinator.net import Net
+from coordinator.recording import Step
+
+_TEXT: Final = {"type": "string"}
+_NUMBER: Final = {"type": "number"}
+CHANNELS: Final[Mapping[str, Mapping[str, Any]]] = {
+    "marking": {"tokens": {"type": "object", "additionalProperties": {"type": "integer"}}, "stimulus": _TEXT},
+    "firing": {"transition": _TEXT, "cause": _TEXT, "number": _NUMBER},
+    "run": {
+        "run": _TEXT,
+        "place": _TEXT,
+        "action": _TEXT,
+        "phase": {"type": "string", "enum": ["started", "ended"]},
+        "status": _TEXT,
+        "cause": _TEXT,
+        "text": _TEXT,
+        "executed": _TEXT,
+        "seconds": _NUMBER,
+    },
+    "report": {"severity": _TEXT, "key": _TEXT, "text": _TEXT, "of": _TEXT},
+}
+"""Topic `/petrobot/NAME`: properties of its messages."""
+
+
+class McapMissingError(Exception):
+    """The package `mcap` is not installed; the text says how to get it."""
+
+
+def write_mcap(path: Path, journal: Journal, net: Net, steps: Iterable[Step]) -> int:
+    """Write the file; gives the number of messages. Raises McapMissingError, OSError."""
+    try:
+        writing = importlib.import_module("mcap.writer")
+    except ImportError:
+        raise McapMissingError("MCAP files need the package mcap: pip install 'petrobot[mcap]'") from None
+    count = 0
+    with path.open("wb") as file:
+        writer = writing.Writer(file)
+        writer.start(profile="petrobot", library="petrobot")
+        writer.add_metadata("petrobot", {k: str(journal.header[k]) for k in ("mission", "mode", "date", "seed")})
+        channels = {name: _channel(writer, name) for name in CHANNELS}
+        for count, (name, time, message) in enumerate(messages(journal, net, steps), 1):
+            data = json.dumps(message, ensure_ascii=False).encode()
+            writer.add_message(channels[name], log_time=time, publish_time=time, sequence=count, data=data)
+        writer.finish()
+    return count
+
+
+def messages(journal: Journal, net: Net, steps: Iterable[Step]) -> Iterator[tuple[str, int, dict[str, Any]]]:
+    """Channel, time (ns since 1970) and body of each message, in order."""
+    origin = round(datetime.fromisoformat(journal.header["date"]).timestamp() * 1e9)
+    for step in steps:
+        time = origin + round(step.time * 1e9)
+        for instruction in step.instructions:
+            told = _told(instruction)
+            if told is not None:
+                yield told[0], time, told[1]
+        tokens = dict(zip(net.places, step.state.marking, strict=True))
+        yield "marking", time, {"tokens": tokens, "stimulus": type(step.stimulus).__name__}
+
+
+def _told(one: Instruction) -> tuple[str, dict[str, Any]] | None:
+    if isinstance(one, Fired):
+        return "firing", {"transition": one.transition, "cause": one.cause, "number": one.number}
+    if isinstance(one, StartRun):
+        return "run", {"run": one.run, "place": one.place, "action": one.action, "phase": "started"}
+    if isinstance(one, RunRecorded):
+        status = "none" if one.status is None else one.status.value
+        how = {"status": status, "cause": one.cause, "text": one.text, "executed": one.executed.value}
+        which = {"run": one.run, "place": one.place, "action": one.action, "phase": "ended"}
+        return "run", {**which, **how, "seconds": one.seconds}
+    if isinstance(one, Report):
+        return "report", {"severity": one.severity.value, "key": one.key, "text": one.text, "of": one.of}
+    return None
+
+
+def _channel(writer: Any, name: str) -> int:
+    schema = {"type": "object", "title": f"petrobot.{name}", "properties": CHANNELS[name]}
+    schema_id = writer.register_schema(f"petrobot.{name}", "jsonschema", json.dumps(schema).encode())
+    return int(writer.register_channel(f"/petrobot/{name}", "json", schema_id))
