@@ -7,22 +7,25 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
 from coordinator.engine import Engine, State
 from coordinator.engine.instructions import Corrected, RunRecorded, StartRun
 from coordinator.journal import JournalWriter, read_journal
-from coordinator.launch import with_runs
+from coordinator.launch import Setting, lockstep_cell, with_runs
 from coordinator.learner import ContextError, Contexts, LearningSelector, usual_contexts
 from coordinator.learning.estimate import Key
 from coordinator.learning.learning import Learning
 from coordinator.learning.records import Choice, End, Passage, of_plain, to_plain
 from coordinator.learning.selectors import RULES
+from coordinator.operation import Operation
+from coordinator.realtime import RealtimeMission
 from coordinator.recording import JournalStore, replay
 from coordinator.task import Executed, Status, Task
-from tests.learning.cell import directory, run, sorting
+from tests.learning.cell import directory, run, scripts, sorting
 
 
 @pytest.fixture(scope="module")
@@ -221,3 +224,19 @@ def test_people_are_shown_what_was_learned(task: Task) -> None:
     assert shown["pick_blind"]["j"] > shown["pick_slow"]["j"] > 0
     assert shown["pick_slow"]["cost"] == pytest.approx(0.35, abs=0.06)
     assert selector.figures("nothing of the kind") == {}
+
+
+async def test_the_operators_page_follows_the_learning(task: Task) -> None:
+    """The snapshot has every alternative's probability at the beginning, and R, C and J once it ran."""
+    selector = learner(task, seed=1)
+    setting = Setting(task, {}, 12, 1, selector)
+    cell, party = lockstep_cell(directory(task), setting, scripts())
+    operation = Operation(cast(RealtimeMission, SimpleNamespace(mission=party.mission)), selector)
+    before = operation.snapshot()["selectors"]["pick"]["alternatives"]
+    assert [a["action"] for a in before] == ["pick_fast", "pick_slow", "pick_blind"]
+    assert all("probability" in a and "reliability" not in a for a in before)
+    assert cell.run(lambda: party.over, 900_000)
+    shown = {a["action"]: a for a in operation.snapshot()["selectors"]["pick"]["alternatives"]}
+    assert shown["pick_slow"]["reliability"] == 1.0
+    assert shown["pick_slow"] == {"action": "pick_slow", **selector.figures("pick")["pick_slow"]}
+    await operation.close()
