@@ -25,6 +25,8 @@ BEYOND: Final = 0.6
 """m that a plan goes on straight where the track should have been found."""
 ROLLED: Final = 0.3
 """m that must have been followed for a line to count as one that has ceased."""
+SILENT: Final = 1.0
+"""s of standing without a set point after which the stream counts as ceased."""
 STUCK: Final = 0.5
 """s of standing without a line after which it counts as lost."""
 NEAR_GATE: Final = 0.40
@@ -195,15 +197,15 @@ async def _follow(ctx: Context, law: str, speed: float, timeout: float, patience
         if why not in ("no_line", "stale") or not state["standing"]:
             lost.clear()
             return None
-        since = lost.setdefault(why, ctx.now)
-        if why == "stale" and ctx.now - since > max(STUCK, min(patience, 1.0)) and ctx.now - begun > patience:
-            return error("stale_set_point", f"the stream of sights has ceased for {ctx.now - since:.1f} s")
-        rolled = state["way"] - way > ROLLED
-        if why == "no_line" and rolled and state["line_end"] is not None and ctx.now - since > STUCK:
+        stuck = ctx.now - lost.setdefault(why, ctx.now)
+        patient = stuck if state["way"] - way > ROLLED else min(stuck, ctx.now - begun - patience)
+        if patient <= (STUCK if why == "no_line" else SILENT):
+            return None
+        if why == "stale":
+            return error("stale_set_point", f"the stream of sights has ceased for {stuck:.1f} s")
+        if state["way"] - way > ROLLED and state["line_end"] is not None:
             return failure("unannounced_end", "the line ceased", at_t=False, line_end=list(state["line_end"]))
-        if ctx.now - begun > patience and ctx.now - since > STUCK:
-            return error("no_line", f"no line to follow for {ctx.now - since:.1f} s")
-        return None
+        return error("no_line", f"no line to follow for {stuck:.1f} s")
 
     try:
         result = await drive.until(judge, timeout)

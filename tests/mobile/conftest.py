@@ -105,4 +105,6 @@ class Photographer:
         high, wide = self.view.height, self.view.width
         light = light.reshape(high, 2, wide, 2).mean(axis=(1, 3))
         grey = self.black + (self.white - self.black) * light
-        return np.clip(np.rint(grey + random.normal(0.0, self.noise, grey.shape)), 0, 255).astype(np.uint8)
+        noisy = np.rint(grey + random.normal(0.0, self.noise, grey.shape))
+        image: NDArray[np.uint8] = np.clip(noisy, 0, 255).astype(np.uint8)
+        return image

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from services.mobile.detection import Detector, TemplateBank, consensus, detect_edges, detect_ridge
 from services.mobile.floor import ScanGrid
@@ -33,7 +34,7 @@ def look(name: str, floor: Floor, pose: Pose, seed: int = 1, photographer: Photo
     return DETECTORS[name]()(GRID, GRID.sample(image), WIDTH, None)
 
 
-def off_line(sight: Sight, floor: Floor, pose: Pose, s: float) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def off_line(sight: Sight, floor: Floor, pose: Pose, s: float) -> NDArray[np.float64]:
     """Distances (m) of the nearest half metre of a sight from the centre line around s + 0.3 to s + 1.6 m."""
     line = [floor.at(s + 0.3 + 0.005 * i) for i in range(260)]
     near = sight.x <= sight.x[0] + 0.5
@@ -41,7 +42,8 @@ def off_line(sight: Sight, floor: Floor, pose: Pose, s: float) -> np.ndarray[tup
     x = pose.x + sight.x[near] * cos - sight.y[near] * sin
     y = pose.y + sight.x[near] * sin + sight.y[near] * cos
     lx, ly = np.array([p.x for p in line]), np.array([p.y for p in line])
-    return np.hypot(x[:, None] - lx[None, :], y[:, None] - ly[None, :]).min(axis=1)
+    off: NDArray[np.float64] = np.hypot(x[:, None] - lx[None, :], y[:, None] - ly[None, :]).min(axis=1)
+    return off
 
 
 @EVERY

@@ -39,7 +39,7 @@ def drive(law: str, floor: Floor, begin: Pose, speed: float, seconds: float) -> 
     samples = [(w, floor.at(float(w))) for w in np.arange(0.0, 6.5, 0.02)]
     for _ in range(round(seconds / PERIOD)):
         s, off = min(((w, math.hypot(p.x - pose.x, p.y - pose.y)) for w, p in samples), key=lambda pair: pair[1])
-        fits = looking(floor, pose, s)  # type: ignore[arg-type]
+        fits = looking(floor, pose, s)
         curvature = LAWS[law].curvature(lambda d: fits.get(round(round(d / 0.02) * 0.02, 2)), present)  # noqa: B023
         assert curvature is not None, "the line is known all around"
         present = profile.towards(present, profile.speed(speed, curvature, 9.0), PERIOD)

@@ -20,7 +20,7 @@ PHOTOGRAPHER = Photographer()
 def drive(
     floor: Floor, first: float, last: float, step: float = 0.02, seed: int = 5
 ) -> list[tuple[Pose, TrackEnd, tuple[float, float]]]:
-    """Images every `step` m along the line, with a little weaving: poses, and what a watcher believes of the end and where it is."""
+    """Images every `step` m along the line, with a little weaving: poses, and the end that a watcher believes in."""
     random = np.random.default_rng(seed)
     watcher, seen = LineWatcher(WATCH, detect_edges), []
     for s in np.arange(first, last, step):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import pytest
 from hypothesis import given
@@ -32,7 +33,7 @@ def test_the_circle_through_a_place_of_resumption_is_the_missing_element(end: Po
 @given(POSES, st.floats(-1.5, 1.5), st.floats(0.2, 3.0))
 def test_points_of_an_arc_are_evenly_apart_and_as_long(begin: Pose, curvature: float, length: float) -> None:
     points = [(begin.x, begin.y), *arc(begin, curvature, length)]
-    steps = [math.dist(a, b) for a, b in zip(points, points[1:], strict=False)]
+    steps = [math.dist(a, b) for a, b in pairwise(points)]
     assert max(steps) - min(steps) < 1e-6
     assert sum(steps) == pytest.approx(length, rel=0.01)
 

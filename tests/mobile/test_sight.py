@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -51,7 +52,7 @@ def test_streamed_points_begin_with_the_nearest_and_keep_apart() -> None:
     x = np.linspace(0.43, 1.4, 60)
     points = thinned(Sight(x, 0.1 * x, 1.0))
     assert points[0] == (x[0], 0.1 * x[0]) and len(points) == STREAMED
-    assert all(math.dist(a, b) >= 0.05 for a, b in zip(points, points[1:], strict=False))
+    assert all(math.dist(a, b) >= 0.05 for a, b in pairwise(points))
 
 
 def test_nothing_seen_cannot_be_described() -> None:
