@@ -91,25 +91,34 @@ class Campaign:
         self._watch = watch
         self._goals = self._throws = self._already = 0
         self._began = time.monotonic()
+        self._sessions: list[dict[str, str]] = []
+        self._session: dict[str, Any] = {}
+
+    @property
+    def complete(self) -> bool:
+        """Whether the table holds all runs already."""
+        blocks = self.plan.blocks
+        return self.table.recover(blocks) == len(blocks)
 
     async def run(self, pool: Pool) -> None:
         """Do what is left. Interrupted at any point, the next `run` in the same folder goes on. Raises CampaignError."""
         blocks = self.plan.blocks
         done = self.table.recover(blocks)
-        at, began = datetime.now(UTC).isoformat(timespec="seconds"), time.monotonic()
-        self._began = began
+        if done == len(blocks) and not self.policy.learns:
+            return
+        self._sessions = read_csv(self.folder / SESSIONS)
+        self._session = {
+            "began_at": datetime.now(UTC).isoformat(timespec="seconds"),
+            "workers": pool.count,
+            "blocks": 0,
+        }
+        self._began = time.monotonic()
         self._already = self._throws = sum(block.count for block in blocks[:done])
-        try:
-            if self.policy.learns:
-                await self._learn(pool, done)
-            else:
-                async for _ in self._results(pool, self._orders(blocks[done:])):
-                    pass
-        finally:
-            now = time.monotonic() - began
-            done_now = len(self._times_since(done))
-            row = [at, pool.count, round(now, 3), done_now, pool.lost]
-            _append(self.folder / SESSIONS, SESSION_COLUMNS, [row])
+        if self.policy.learns:
+            await self._learn(pool, done)
+        else:
+            async for _ in self._results(pool, self._orders(blocks[done:])):
+                pass
 
     async def _learn(self, pool: Pool, done: int) -> None:
         """Batch by batch; what had been done before is learned again from the table."""
@@ -142,7 +151,7 @@ class Campaign:
                 block, task = going[0]
                 result = await task
                 going.popleft()
-                yield self._keep(block, result)
+                yield self._keep(pool, block, result)
         finally:
             for _, task in going:
                 task.cancel()
@@ -152,7 +161,7 @@ class Campaign:
         for block in blocks:
             yield block, {"block": block.to_plain(), "weights": self.policy.weights(block)}
 
-    def _keep(self, block: Block, result: Mapping[str, Any]) -> list[Row]:
+    def _keep(self, pool: Pool, block: Block, result: Mapping[str, Any]) -> list[Row]:
         if "fault" in result:
             raise CampaignError(str(result["fault"]))
         rows = rows_of(block, result)
@@ -160,6 +169,7 @@ class Campaign:
         if result[PLOTS] and not plots.exists():
             plots.write_text(json.dumps(result[PLOTS], indent=2) + "\n", encoding="utf-8")
         _append(self.folder / TIMES, TIME_COLUMNS, [_times(block, result)])
+        self._note_session(pool)
         self.table.append(rows)
         self._throws += len(rows)
         self._goals += sum(1 for row in rows if row.throw is not None and row.throw.goals > 0)
@@ -168,8 +178,15 @@ class Campaign:
             self._watch(Progress(self._throws, self.plan.runs, self._already, self._goals, now))
         return rows
 
-    def _times_since(self, block: int) -> list[dict[str, str]]:
-        return [row for row in read_csv(self.folder / TIMES) if int(row["block"]) >= block]
+    def _note_session(self, pool: Pool) -> None:
+        """Write down this session so far, so that one that is killed is known, too."""
+        self._session["blocks"] += 1
+        self._session |= {"wall_s": round(time.monotonic() - self._began, 3), "lost": pool.lost}
+        temporary = self.folder / f"{SESSIONS}.new"
+        temporary.unlink(missing_ok=True)
+        rows = [*self._sessions, self._session]
+        _append(temporary, SESSION_COLUMNS, [[row[name] for name in SESSION_COLUMNS] for row in rows])
+        temporary.replace(self.folder / SESSIONS)
 
 
 def _times(block: Block, result: Mapping[str, Any]) -> list[Any]:

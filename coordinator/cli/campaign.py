@@ -65,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--mock", metavar="FILE", type=Path, help="replace actions by scripted ones")
     parser.add_argument(
-        "--out", metavar="FOLDER", type=Path, help="where table and estimates go (campaigns/TASK-SELECTOR-S)"
+        "--out", metavar="FOLDER", type=Path, help="where table and estimates go (campaigns/TASK-SELECTOR-S-ID)"
     )
     parser.add_argument(
         "--resume", metavar="FOLDER", type=Path, help="go on with this one; the same as giving its --out again"
@@ -79,7 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run or resume the campaign; print and write its result."""
     from coordinator.campaign.conduct import Campaign
-    from coordinator.campaign.plan import CampaignError, read_manifest
+    from coordinator.campaign.plan import CampaignError, identity, read_manifest
     from coordinator.campaign.progress import ProgressLine
     from coordinator.campaign.table import write_parquet
 
@@ -92,8 +92,10 @@ def run(options: argparse.Namespace) -> int:
             task = load_task(options.task)
             _refuse_unfit(task, options.services)
             plan = _plan(options, task)
-            folder = options.out or Path("campaigns") / f"{Path(plan.task).stem}-{plan.selector}-{plan.seed}"
+            folder = options.out or Path("campaigns") / f"{task.name}-{plan.selector}-{plan.seed}-{identity(plan)[:6]}"
         campaign = Campaign(folder, plan, shown)
+        if campaign.complete and options.json != "-":
+            print(f"nothing left to do: {folder} holds all runs; remove it, or give another --out, to run them again")
         try:
             asyncio.run(_conduct(campaign, options))
         finally:

@@ -88,6 +88,24 @@ def test_train_forecast_run_and_compare(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 @pytest.mark.processes
+def test_a_finished_campaign_is_not_run_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same command gives the same result at once; another number of runs has a folder of its own."""
+    monkeypatch.chdir(tmp_path)
+    told = ["campaign", *TOY, "--workers", "1", "--regime", "easy"]
+    assert main([*told, "--runs", "4"]) == 0
+    (folder,) = (tmp_path / "campaigns").iterdir()
+    first = (folder / "sessions.csv").read_bytes()
+    capsys.readouterr()
+    assert main([*told, "--runs", "4"]) == 0
+    assert "nothing left to do" in capsys.readouterr().out
+    assert (folder / "sessions.csv").read_bytes() == first
+    assert main([*told, "--runs", "5"]) == 0
+    assert len(list((tmp_path / "campaigns").iterdir())) == 2
+
+
+@pytest.mark.processes
 def test_a_killed_campaign_goes_on(tmp_path: Path) -> None:
     """SIGINT on the way, then --resume: the table of one that was never interrupted."""
     arguments = [
@@ -119,6 +137,8 @@ def test_a_killed_campaign_goes_on(tmp_path: Path) -> None:
     assert start("x", "--resume", "part").wait() == 0
     assert start(*arguments, "--out", "whole").wait() == 0
     assert table.read_bytes() == (tmp_path / "whole" / "table.csv").read_bytes()
+    sessions = (tmp_path / "part" / "sessions.csv").read_text(encoding="utf-8").splitlines()
+    assert len(sessions) == 3  # the killed one is known, too
 
 
 @pytest.mark.parametrize(
@@ -170,6 +190,8 @@ def test_progress_is_for_terminals(capsys: pytest.CaptureFixture[str]) -> None:
         for done in (1, 2):
             shown(Progress(done, 2, 0, 1, float(done)))
         shown.close()
-        told = os.read(ours, 1000)
+        told = b""
+        while not told.endswith(b"\n"):
+            told += os.read(ours, 1000)
     os.close(ours)
     assert told.count(b"\r[") == 2 and told.count(b"\n") == 1
