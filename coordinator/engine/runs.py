@@ -69,7 +69,7 @@ def end_stopping(draft: Draft, run: Run, end: RunEnded) -> None:
     """A result that came after the cancel: recorded, moves nothing, its writes are dropped; the run has stopped."""
     _forget(draft, run)
     counted = run.counts or Counts.NONE
-    status = None if counted is Counts.NONE else Status(counted.value)
+    status = None if counted is Counts.NONE or end.executed is Executed.NO else Status(counted.value)
     text = f"{run.reason}; it had ended with {end.status}" + (f", {end.cause}" if end.cause else "")
     _record(draft, run, status, replace(end, text=text), cancelled=True)
 

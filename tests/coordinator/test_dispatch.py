@@ -29,7 +29,6 @@ def done(call: str, status: str = "success", cause: str = "") -> m.Outcome:
 
 
 def test_nothing_starts_on_the_device_before_the_cancelled_run_is_known_to_have_stopped() -> None:
-    """PlanSys2 #399: two performers for one token."""
     bench = Bench().begin()
     bench.ring(1.0)
     assert bench.fired[-1] == "rung" and bench.sent(m.Call, m.Cancel) == [m.Cancel(WORK, STOPPED)]
@@ -41,7 +40,7 @@ def test_nothing_starts_on_the_device_before_the_cancelled_run_is_known_to_have_
 
 
 def test_completion_crosses_with_the_cancel() -> None:
-    """SMACH #53, YASMIN #62: the result that comes after the cancel is recorded, moves nothing, and frees the device."""
+    """The result that comes after the cancel is recorded, moves nothing, and frees the device."""
     bench = Bench().begin()
     bench.ring(1.0)
     bench.say(1.1, done(WORK, "failure", "dropped"))
@@ -53,7 +52,6 @@ def test_completion_crosses_with_the_cancel() -> None:
 
 
 def test_a_preemption_that_comes_just_after_the_end_cancels_nothing() -> None:
-    """SMACH #98, the other order: the end was first."""
     bench = Bench().begin()
     bench.say(1.0, done(WORK))
     bench.ring(1.0)
@@ -61,7 +59,7 @@ def test_a_preemption_that_comes_just_after_the_end_cancels_nothing() -> None:
 
 
 def test_a_performer_that_never_answers_is_stuck_and_what_needs_its_device_errs_unexecuted() -> None:
-    """YASMIN #102, PlanSys2 #400: StopFailed once its own time and the escalation's are over, not before."""
+    """StopFailed once its own time and the escalation's are over, not before."""
     bench = Bench().begin()
     bench.ring(1.0)
     bench.go(1.0 + WITHIN + ESCALATION - 0.01)

@@ -1,7 +1,7 @@
 """Races by name: two things that cross on their way, in either order. Each has one right outcome, and tokens stay whole.
 
-Where other coordination systems got one of them wrong, the name of the trouble is in the test (SMACH #53, #98, YASMIN #62,
-#102, PlanSys2 #399, #400).
+Where other coordination systems got one of them wrong, the name of the trouble is in the test; all of them by name, over a node,
+in tests/coordinator/test_named_races.py.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ ARM = {"do_a": "arm", "do_h": "arm"}
 
 
 def test_completion_crosses_with_cancel_recorded_and_moves_nothing(play: Plays) -> None:
-    """SMACH #53, YASMIN #62: a result after the cancel must not end anything a second time."""
+    """A result after the cancel must not end anything a second time (SMACH #98: it gave the outcome)."""
     p = play("a!=1 h! r done", CATCH, "ball*", devices=ARM, out={"a": {"v": "point"}}, variables={"point": 0})
     p(EventOccurred("ball"))
     assert p.started == ["a#1"]
@@ -98,7 +98,7 @@ def test_error_end_and_preempt_pending_together(play: Plays) -> None:
 
 
 def test_nothing_uses_a_device_before_the_cancelled_run_has_stopped(play: Plays) -> None:
-    """PlanSys2 #399: two performers for one token."""
+    """PlanSys2 #400: two performers for one token."""
     p = play("a!=1 h! r done", CATCH, "ball*", devices=ARM)
     p(EventOccurred("ball"))
     assert p.marked == {"h": 1} and p.started == ["a#1"] and p.state.run("h#1").phase is Phase.WAITING
@@ -113,7 +113,7 @@ def test_start_at_once_does_not_wait(play: Plays) -> None:
 
 
 def test_run_that_cannot_be_stopped_keeps_its_fence_and_the_next_one_errs_without_executing(play: Plays) -> None:
-    """YASMIN #102, PlanSys2 #400: a performer that never answers."""
+    """PlanSys2 #399: a performer that never answers."""
     p = play("a!=1 h! r done", CATCH, "ball*", devices=ARM)
     p(EventOccurred("ball"), StopFailed("a#1", "no answer for 2 s"))
     assert p.fired == ["caught", "lost"] and p.started == ["a#1"]
