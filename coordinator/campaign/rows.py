@@ -120,7 +120,11 @@ def _text(value: Any) -> str:
         return "true" if value else "false"
     if isinstance(value, float):
         return repr(round(value, 9))
-    return str(value) if isinstance(value, str | int) else _json(value)
+    if isinstance(value, str):
+        return value.replace("\r\n", "\n").replace(
+            "\r", "\n"
+        )  # a bare carriage return would end a line of the CSV file
+    return str(value) if isinstance(value, int) else _json(value)
 
 
 def read_row(record: Mapping[str, str]) -> Row:

@@ -93,7 +93,7 @@ def test_a_deferred_verdict_corrects_the_entry() -> None:
 
 # --- rows ------------------------------------------------------------------------------------------------------------------
 
-TEXT = st.text(max_size=12)
+TEXT = st.text(st.characters(exclude_characters="\r", exclude_categories=["Cs"]), max_size=12)
 FINITE = st.floats(-1e6, 1e6).map(lambda x: round(x, 6))
 RUNS = st.builds(
     RunEntry,
@@ -148,6 +148,16 @@ def test_rows_come_back_as_they_were(throw: Throw | None, score: dict[str, Any],
         row.k,
         row.mission_s,
     )
+
+
+def test_carriage_returns_do_not_break_the_table() -> None:
+    """They become newlines, which CSV quotes."""
+    row = Row(1, "", 1, 1, 0, 1.0, Throw(1, 0.0, cause="one\rtwo\r\nthree"))
+    names = columns(TOY, [])
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows([names, cells(TOY, row, names)])
+    (record,) = csv.DictReader(io.StringIO(out.getvalue(), newline=""))
+    assert record["cause"] == "one\ntwo\nthree"
 
 
 @given(THROWS)
