@@ -7,7 +7,7 @@ journal or in the table of a campaign, derives the same state again by `apply` i
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -126,10 +126,15 @@ class Learning:
         return self.known.merged(self.gained)
 
     def comparison(self, primitive_task: str, context: str | None = None) -> Comparison:
-        """The alternatives of a primitive task judged: in one context, or over all of them as scenarios (None)."""
-        tallies = self.estimates.of(primitive_task, context)
-        alternatives = self.task.primitive_tasks[primitive_task].alternatives
-        return compare({a: tallies.get(a, {}) for a in alternatives}, self.question(primitive_task))
+        """The alternatives of a primitive task judged: in one context, or over all of them as scenarios (None).
+
+        Over scenarios the target reliability is the one that was given, else the one that the task file declares.
+        """
+        tallies, primitive = self.estimates.of(primitive_task, context), self.task.primitive_tasks[primitive_task]
+        question = self.question(primitive_task)
+        if context is None and question.target is None:
+            question = replace(question, target=primitive.target_reliability)
+        return compare({a: tallies.get(a, {}) for a in primitive.alternatives}, question)
 
     # --- state -----------------------------------------------------------------------------------------------------
 

@@ -185,6 +185,22 @@ def test_a_deferred_verdict_corrects_r_once(task: Task) -> None:
     assert selector.learning.selectors["pick"].learner("regime=A").successes[0, 1] == 0.0
 
 
+def test_alternatives_are_judged_in_a_context_or_over_scenarios(task: Task) -> None:
+    """In one context everything known counts; over scenarios the declared target (0.9) rules out what never reaches it."""
+    selector = learner(task, "round_robin", seed=1)
+    for regime in ("A", "B"):
+        run(task, selector, runs=120, parameters={"regime": regime})
+    judged = selector.learning.comparison("pick", "regime=A")
+    assert judged.of("pick_blind").scenarios == ("regime=A",)
+    assert judged.best == "pick_fast"  # R 1/3, but at a quarter of the cost
+    over = selector.learning.comparison("pick")
+    assert over.best == "pick_slow"
+    assert over.of("pick_slow").scenarios == ("regime=A", "regime=B")
+    assert over.of("pick_slow").runs == 2 * judged.of("pick_slow").runs
+    assert not over.of("pick_blind").admissible
+    assert not over.of("pick_fast").admissible
+
+
 def test_firings_are_counted(task: Task) -> None:
     """Every firing is a passage; only transitions that wait for an event alone have a wait."""
     selector = learner(task, "fixed", seed=1)
