@@ -201,7 +201,7 @@ def caught_or_missed(n: int, caught: int) -> Tally:
 
 def test_a_preempting_event_is_a_cause_not_a_race() -> None:
     """The event comes at half a second in 93 of 100 runs or never. As a cause its share is met exactly; an independent
-    exponential with the same mean wait would make it 58 to 87 %."""
+    exponential with the same mean wait makes it 87 %."""
     task, _ = with_runs(sorting(), 1)
     estimates = Estimates(
         {
