@@ -72,6 +72,7 @@ class Supervisor:
         self._respawn = respawn
         self._notice = notice or (lambda _: None)
         self._stopping = False
+        self._over = asyncio.Event()
 
     async def __aenter__(self) -> Supervisor:
         """Start all programs; raises LaunchError when one does not get ready within 60 s."""
@@ -98,6 +99,7 @@ class Supervisor:
     async def stop(self) -> None:
         """Ask all to end, and kill those that do not within 5 s."""
         self._stopping = True
+        self._over.set()
         for child in self._children:
             _signal(child, signal.SIGTERM)
         waiting = [child.task for child in self._children if child.task]
@@ -141,7 +143,9 @@ class Supervisor:
                 return
             pause = FIRST_PAUSE if loop.time() - started > STABLE_AFTER else min(2 * pause, LONGEST_PAUSE)
             self._notice(f"node {child.program.name} died; starting it again in {pause:g} s")
-            await asyncio.sleep(pause)
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(pause):
+                    await self._over.wait()
 
     async def _run_once(self, child: _Child) -> None:
         with child.log.open("ab") as log:
