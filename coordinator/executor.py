@@ -151,6 +151,7 @@ class Executor:
         Independent effects of one turn share one sync. What waits is synced within `SYNC_WITHIN`, and acknowledged then.
         """
         if self.store.safe:
+            self._unsafe_since = None
             self._acknowledge()
             return
         leaving = [effect for effect in self._effects if isinstance(effect, _LEAVES_THE_PROCESS)]

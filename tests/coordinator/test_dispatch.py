@@ -297,3 +297,16 @@ def test_a_firing_costs_one_sync_if_it_starts_hardware_and_none_otherwise(
     bench.go(0.1 + 0.5 + 0.05)
     assert store.safe and m.ResultAck(WORK) in bench.sent(), "within half a second the node may forget it all the same"
     assert writer.syncs - before <= 3
+
+
+def test_a_sync_from_outside_leaves_nothing_due(tmp_path: Path) -> None:
+    """The operator's commands are synced by whoever takes them: then there is nothing to wake up for."""
+    store = JournalStore(JournalWriter(tmp_path / "run.journal", {}), 0.0)
+    bench = Bench(store=store)
+    bench.link(0.0)
+    bench.executor.stimulate(0.0, Begin())
+    bench.executor.stimulate(0.1, Pause("by hand"))
+    store.sync()
+    bench.go(0.7)
+    due = bench.executor.due()
+    assert store.safe and (due is None or due > 0.7)
