@@ -10,6 +10,7 @@ import asyncio
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
+from coordinator.controls import Answer, Controls, refusal
 from coordinator.engine import (
     Abort,
     AddTokens,
@@ -33,38 +34,44 @@ from coordinator.realtime import RealtimeMission
 from coordinator.watching import Watching, shown_selectors
 from services.comm.notice import Progress
 
-FREE = frozenset({"estop", "take_controls", "ask_controls", "release_controls"})
 ANSWERS = 1.5
 """Seconds that nodes have to answer a pause."""
 REFUSED = frozenset({"refused"})
-
-Answer = dict[str, Any]
 
 
 class Operation:
     """One mission run as its operators see it; `name` shows in the snapshot."""
 
-    def __init__(self, shell: RealtimeMission, selector: FirstAlternative) -> None:
+    def __init__(
+        self,
+        shell: RealtimeMission,
+        selector: FirstAlternative,
+        feed: Feed | None = None,
+        controls: Controls | None = None,
+        *,
+        starts: bool = False,
+    ) -> None:
+        """`feed` and `controls` are those of a page that outlives this run; `starts` says that it can begin another."""
         self.shell = shell
         self.mission = shell.mission
         self.executor = shell.mission.executor
-        self.feed = Feed()
+        self.feed = feed or Feed()
+        self.controls = controls or Controls(self.feed)
         self._selector = selector
-        self._holder: str | None = None
-        self._asking: list[str] = []
         self._refusals: list[str] = []
-        self._clients = 0
         loop = asyncio.get_running_loop()
         where = {name: entry.node for name, entry in self.executor.directory.actions.items()}
         self.narrator = Narrator(self.feed, self.executor.task, where, loop.time())
         self.narrator.begin(
             self.executor.mission,
             "realtime",
-            controls=self._controls(),
+            starts=starts,
+            controls=self.controls.plain(),
             selectors=shown_selectors(self.executor.task, selector),
+            nodes=dict(self.feed.state["nodes"]),
         )
         self.executor.observers.extend([self.narrator, self])
-        self.watching = Watching(shell, self.feed, selector, loop.time(), lambda: self._clients > 0)
+        self.watching = Watching(shell, self.feed, selector, loop.time(), lambda: self.feed.watched)
         self.executor.observers.append(self.watching)
 
     async def close(self) -> None:
@@ -95,53 +102,20 @@ class Operation:
 
     def subscribe(self, receive: Callable[[dict[str, Any]], None]) -> Callable[[], None]:
         """Give every later change to `receive`."""
-        self._clients += 1
-        stop = self.feed.subscribe(receive)
-
-        def leave() -> None:
-            self._clients -= 1
-            stop()
-
-        return leave
+        return self.feed.subscribe(receive)
 
     async def command(self, who: str, verb: str, data: Mapping[str, Any]) -> Answer:
         """Carry out a command; answers after it is journaled."""
-        if verb not in FREE and self._holder != who:
-            return _no("not_holder", f"{self._holder or 'nobody'} holds the controls; take or ask for them first")
+        answer = self.controls.fault(who, verb) or self.controls.carry_out(who, verb, data)
+        if answer is not None:
+            return answer
         carry_out: Callable[[str, Mapping[str, Any]], Awaitable[Answer]] | None = getattr(self, f"_do_{verb}", None)
         if carry_out is None:
-            return _no("unknown", f"no command {verb!r} for a mission run that goes on")
+            return refusal("unknown", f"no command {verb!r} for a mission run that goes on")
         try:
             return await carry_out(who, data)
         except (KeyError, TypeError, ValueError) as fault:
-            return _no("bad_data", f"{verb}: {fault}")
-
-    # --- who holds the controls --------------------------------------------------------------------------------------
-
-    async def _do_take_controls(self, who: str, data: Mapping[str, Any]) -> Answer:
-        if self._holder not in (None, who):
-            return _no("held", f"{self._holder} holds the controls; ask for them")
-        return self._hand_over(who)
-
-    async def _do_ask_controls(self, who: str, data: Mapping[str, Any]) -> Answer:
-        if who != self._holder and who not in self._asking:
-            self._asking.append(who)
-        return self._hand_over(self._holder)
-
-    async def _do_release_controls(self, who: str, data: Mapping[str, Any]) -> Answer:
-        if who == self._holder:
-            wanted = data.get("to")
-            return self._hand_over(wanted if wanted in self._asking else None)
-        return {"ok": True}
-
-    def _hand_over(self, holder: str | None) -> Answer:
-        self._holder = holder
-        self._asking = [name for name in self._asking if name != holder]
-        self.feed.emit("controls", controls=self._controls())
-        return {"ok": True}
-
-    def _controls(self) -> dict[str, Any]:
-        return {"holder": self._holder, "asking": list(self._asking)}
+            return refusal("bad_data", f"{verb}: {fault}")
 
     # --- commands that are stimuli -----------------------------------------------------------------------------------
 
@@ -175,7 +149,11 @@ class Operation:
         return self._order(Step())
 
     async def _do_abort(self, who: str, data: Mapping[str, Any]) -> Answer:
-        return self._order(Abort(f"by {who}"))
+        return self.abort(f"by {who}")
+
+    def abort(self, reason: str) -> Answer:
+        """Give the run up, whoever holds the controls."""
+        return self._order(Abort(reason))
 
     async def _do_breakpoint(self, who: str, data: Mapping[str, Any]) -> Answer:
         name = str(data["element"]).partition(".")[2]
@@ -199,7 +177,7 @@ class Operation:
         task, action = str(data["primitive_task"]), data.get("action")
         primitive = self.executor.task.primitive_tasks[task]
         if action is not None and action not in primitive.alternatives:
-            return _no("refused", f"{action} is no alternative of {task}: {', '.join(primitive.alternatives)}")
+            return refusal("refused", f"{action} is no alternative of {task}: {', '.join(primitive.alternatives)}")
         self._selector.override(task, action)
         selector = {**self.feed.state["selectors"].get(task, {}), "override": action}
         self.feed.emit("selector", name=task, selector=selector)
@@ -207,12 +185,12 @@ class Operation:
 
     def _order(self, stimulus: Stimulus) -> Answer:
         if self.mission.stage is not Stage.RUNNING:
-            return _no("idle", f"the mission run is {self.mission.stage.value}")
+            return refusal("idle", f"the mission run is {self.mission.stage.value}")
         self._refusals.clear()
         self.executor.stimulate(asyncio.get_running_loop().time(), stimulus)
         self.executor.store.sync()
         self.shell.settle()
-        return _no("refused", self._refusals[0]) if self._refusals else {"ok": True}
+        return refusal("refused", self._refusals[0]) if self._refusals else {"ok": True}
 
     # --- straight to the nodes ---------------------------------------------------------------------------------------
 
@@ -233,7 +211,3 @@ class Operation:
         deadline = asyncio.get_running_loop().time() + timeout
         while not ready() and asyncio.get_running_loop().time() < deadline:
             await asyncio.sleep(0.02)
-
-
-def _no(code: str, text: str) -> Answer:
-    return {"ok": False, "code": code, "text": text}

@@ -97,6 +97,10 @@ class FirstAlternative:
         if action is not None:
             self._overridden[task] = action
 
+    def overridden(self, task: str) -> str | None:
+        """The operator's choice for a primitive task; None where the choice is free."""
+        return self._overridden.get(task)
+
     def figures(self, task: str) -> Mapping[str, Mapping[str, float]]:
         """What people are shown of each alternative: nothing is known here."""
         return {}

@@ -33,6 +33,7 @@ class Command:
 
 COMMANDS = (
     Command("run", "run a task"),
+    Command("serve", "the operator's page: draw tasks and start them"),
     Command("resume", "go on with a run whose coordinator was killed"),
     Command("watch", "follow the run that goes on", "operate.watch"),
     Command("pause", "pause it; every node says whether its devices hold", "operate.pause"),

@@ -232,18 +232,27 @@ async def drive(
 async def _page(shell: RealtimeMission, options: argparse.Namespace) -> AsyncIterator[None]:
     """The operator's page, or with --no-page his protocol alone, while the mission run goes on."""
     from coordinator.cli.loading import SHIPPED
+    from coordinator.cli.serve import OWN_TASKS
     from coordinator.door_file import Door, door_open
     from coordinator.hmi.journals import JournalHistory
     from coordinator.hmi.server import start_page
     from coordinator.operation import Operation
     from coordinator.partners import FirstAlternative
+    from coordinator.station import offered
 
     selector = shell.mission.executor.selector
     assert isinstance(selector, FirstAlternative)
     operation = Operation(shell, selector)
     history = JournalHistory(options.folder.parent)
+    callers, directory = shell.mission.callers, shell.mission.executor.directory
     page = await start_page(
-        operation, tasks_folder=SHIPPED, port=options.page_port, history=history, page=not options.no_page
+        operation,
+        tasks_folder=OWN_TASKS,
+        shipped=SHIPPED,
+        port=options.page_port,
+        offers=lambda: offered(directory, lambda action, node: callers[node].up and action in callers[node].offers),
+        history=history,
+        page=not options.no_page,
     )
     if not options.no_page:
         print(f"page: {page.url}", file=sys.stderr, flush=True)

@@ -31,7 +31,7 @@ def add_routes(app: web.Application) -> None:
 
 
 async def _list(request: web.Request) -> web.Response:
-    return json_answer([{"name": name} for name in request.app[HOUSE].store.names()])
+    return json_answer(request.app[HOUSE].store.listed())
 
 
 async def _open(request: web.Request) -> web.Response:
@@ -129,6 +129,7 @@ async def _described(house: House, task: TaskText) -> dict[str, Any]:
     return {
         "name": task.name,
         "revision": task.revision,
+        "own": task.own,
         "text": task.text,
         "document": document,
         "findings": findings,

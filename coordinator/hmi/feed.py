@@ -27,6 +27,11 @@ class Feed:
         """The state now; look, do not alter."""
         return self._state
 
+    @property
+    def watched(self) -> bool:
+        """Whether anybody follows."""
+        return bool(self._receivers)
+
     def emit(self, kind: str, *, time: float | None = None, **fields: Any) -> None:
         """Something changed. `time` is the mission's clock (s); without it the clock stays."""
         if kind not in KINDS:

@@ -80,9 +80,10 @@ class Narrator:
             Finished: self._finished,
         }
 
-    def begin(self, mission: str, mode: str, **parts: Any) -> None:
+    def begin(self, mission: str, mode: str, *, starts: bool = True, **parts: Any) -> None:
         """A mission run begins: clients get a snapshot with the task at its initial marking.
 
+        `starts` says whether another mission run can be started when this one has ended.
         `parts` are further parts of the snapshot that outlive a mission run, such as `controls`, `nodes` and `selectors`.
         """
         flat = self.task.flat
@@ -91,7 +92,7 @@ class Narrator:
             for name, e in flat.events.items()
         }
         state = {key: value for key, value in empty_state().items() if key != "sequence"} | {
-            "mission": {"id": mission, "state": "idle", "mode": mode, "firings": 0},
+            "mission": {"id": mission, "state": "idle", "mode": mode, "firings": 0, "starts": starts},
             "task": picture(self.task),
             "marking": dict(zip(self._net.places, self._net.initial, strict=True)),
             "events": events,

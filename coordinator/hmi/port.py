@@ -13,6 +13,7 @@ PROTOCOL = 1
 
 VERBS = frozenset(
     {
+        "load",
         "start",
         "pause",
         "resume",

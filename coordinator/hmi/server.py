@@ -66,6 +66,7 @@ async def start_page(
     port_object: MissionPort,
     *,
     tasks_folder: Path,
+    shipped: Path | None = None,
     host: str = "127.0.0.1",
     port: int = 0,
     token: str | None = None,
@@ -77,13 +78,14 @@ async def start_page(
 ) -> Page:
     """Serve the page of a mission; without `page` only the operator's protocol: the WebSocket, snapshot and commands.
 
-    `port` 0 takes a free one. `names` are further names under which browsers ask for this server (needed when `host` is
+    Tasks are saved in `tasks_folder`; those of `shipped` are offered, too, and a save of one makes a copy there. `port` 0
+    takes a free one. `names` are further names under which browsers ask for this server (needed when `host` is
     not loopback). `token` is drawn anew unless given. Raises OSError when the address cannot be bound.
     """
     listener = _listen(host, port)
     number = listener.getsockname()[1]
     doors = Doors(token or secrets.token_urlsafe(24), number, names_for(host, names), tls is not None)
-    house = House(port_object, TaskStore(tasks_folder), doors, offers, history)
+    house = House(port_object, TaskStore(tasks_folder, shipped), doors, offers, history)
     runner = web.AppRunner(_application(house, page), access_log=None, keepalive_timeout=30.0, shutdown_timeout=1.0)
     await runner.setup()
     assert runner.server is not None

@@ -1,4 +1,5 @@
-"""The folder of task files: names, texts, revisions; a save that would undo another's is refused with both versions."""
+"""The folders of task files: names, texts, revisions. Shipped ones are read only; a save that would undo another's is refused
+with both versions."""
 
 from __future__ import annotations
 
@@ -39,6 +40,8 @@ class TaskText:
 
     name: str
     text: str
+    own: bool = True
+    """Whether it stands in the user's own folder; a shipped one is saved as a copy there."""
 
     @property
     def revision(self) -> str:
@@ -47,26 +50,43 @@ class TaskText:
 
 
 class TaskStore:
-    """Task files of one folder, by bare name."""
+    """Task files by bare name: those of the user's own folder, made when it is first needed, and behind them shipped ones."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, shipped: Path | None = None) -> None:
         self._folder = folder
+        self._shipped = shipped
+
+    @property
+    def folder(self) -> Path:
+        """Where tasks are saved."""
+        return self._folder
 
     def names(self) -> list[str]:
         """All task files."""
-        return sorted(p.stem for p in self._folder.glob("*.toml") if _NAME.fullmatch(p.stem))
+        return sorted(self._own() | self._behind())
+
+    def listed(self) -> list[dict[str, object]]:
+        """All task files: {name, own, shipped}; one that is both is the user's copy of a shipped one."""
+        own, behind = self._own(), self._behind()
+        return [{"name": name, "own": name in own, "shipped": name in behind} for name in sorted(own | behind)]
 
     def read(self, name: str) -> TaskText:
-        """One task file. Raises StoreError."""
+        """One task file, the user's own if there is one. Raises StoreError."""
         path = self._path(name)
         try:
-            if path.stat().st_size > LARGEST_FILE:
-                raise StoreError(413, f"{name}.toml is larger than {LARGEST_FILE} bytes")
-            return TaskText(name, path.read_bytes().decode("utf-8"))
+            return TaskText(name, _content(path))
         except FileNotFoundError:
-            raise StoreError(404, f"no task file {name}.toml") from None
-        except (OSError, UnicodeDecodeError) as fault:
-            raise StoreError(400, f"{name}.toml cannot be read: {fault}") from fault
+            pass
+        if self._shipped is not None:
+            with contextlib.suppress(FileNotFoundError):
+                return TaskText(name, _content(self._shipped / path.name), own=False)
+        raise StoreError(404, f"no task file {name}.toml")
+
+    def _own(self) -> set[str]:
+        return _stems(self._folder)
+
+    def _behind(self) -> set[str]:
+        return _stems(self._shipped) if self._shipped is not None else set()
 
     def save(self, name: str, base: str | None, document: dict[str, object], renames: list[Rename]) -> TaskText:
         """Write an edited document; `base` is the revision that the edit began from, None for a new file.
@@ -115,6 +135,7 @@ class TaskStore:
             raise StoreError(413, f"{name}.toml would be larger than {LARGEST_FILE} bytes")
         temporary = ""
         try:
+            self._folder.mkdir(parents=True, exist_ok=True)
             with tempfile.NamedTemporaryFile(dir=self._folder, prefix=f".{name}.", delete=False) as file:
                 temporary = file.name
                 file.write(text.encode())
@@ -127,3 +148,19 @@ class TaskStore:
             with contextlib.suppress(OSError):
                 Path(temporary).unlink(missing_ok=True)
             raise StoreError(400, f"{name}.toml cannot be written: {fault}") from fault
+
+
+def _stems(folder: Path) -> set[str]:
+    return {path.stem for path in folder.glob("*.toml") if _NAME.fullmatch(path.stem)}
+
+
+def _content(path: Path) -> str:
+    """A task file's text. Raises FileNotFoundError, StoreError."""
+    try:
+        if path.stat().st_size > LARGEST_FILE:
+            raise StoreError(413, f"{path.name} is larger than {LARGEST_FILE} bytes")
+        return path.read_bytes().decode("utf-8")
+    except FileNotFoundError:
+        raise
+    except (OSError, UnicodeDecodeError) as fault:
+        raise StoreError(400, f"{path.name} cannot be read: {fault}") from fault

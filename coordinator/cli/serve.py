@@ -1,0 +1,114 @@
+"""Serve the operator's page and stay: draw tasks, start them over the nodes, as often as wanted, until Ctrl-C."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import os
+import signal
+from contextlib import AbstractAsyncContextManager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from coordinator.cli import CommandError
+from coordinator.cli.loading import SHIPPED, add_services_argument, load_directory
+
+if TYPE_CHECKING:
+    from coordinator.hmi.server import Page
+    from coordinator.station import Station
+    from services.comm.directory import Directory
+
+EXAMPLE = "petrobot serve --up"
+OWN_TASKS = Path("tasks")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    add_services_argument(parser)
+    parser.add_argument(
+        "--tasks",
+        metavar="FOLDER",
+        type=Path,
+        default=OWN_TASKS,
+        help="your own tasks, made when first needed; those that come with petrobot are offered, too (%(default)s)",
+    )
+    parser.add_argument(
+        "--up", action="store_true", help="launch the nodes of this host, and end them with this command"
+    )
+    parser.add_argument("--mock", metavar="FILE", type=Path, help="with --up: replace actions by scripted ones")
+    parser.add_argument(
+        "--page-port", type=int, default=0, metavar="PORT", help="the page's port (default: a free one)"
+    )
+    parser.add_argument("--journal", metavar="FOLDER", type=Path, help="where runs are kept (default: runs)")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Serve until Ctrl-C."""
+    if options.mock is not None and not options.up:
+        raise CommandError(2, "--mock is for nodes that are launched here: give --up, too, or `petrobot up --mock`")
+    return asyncio.run(_serve(load_directory(options.services), options))
+
+
+async def _serve(directory: Directory, options: argparse.Namespace) -> int:
+    from coordinator.hmi.store import TaskStore
+    from coordinator.realtime import credentials_of
+    from coordinator.runfolder import DEFAULT
+    from coordinator.station import Station
+    from coordinator.supervisor import LaunchError
+
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    credentials_of(directory)  # keys that cannot be used are told before anything is launched
+    runs = options.journal or DEFAULT
+    try:
+        async with _nodes(directory, runs, options):
+            station = Station(directory, TaskStore(options.tasks, SHIPPED), runs, options.mock)
+            try:
+                await station.look()
+                await _page(station, runs, options, stop)
+            finally:
+                await station.close()
+    except LaunchError as fault:
+        raise CommandError(3, str(fault)) from fault
+    return 0
+
+
+async def _page(station: Station, runs: Path, options: argparse.Namespace, stop: asyncio.Event) -> None:
+    """The page, until told to stop; a run that goes on then is aborted before the page goes."""
+    from coordinator.hmi.journals import JournalHistory
+    from coordinator.hmi.server import start_page
+
+    try:
+        page = await start_page(
+            station,
+            tasks_folder=options.tasks,
+            shipped=SHIPPED,
+            port=options.page_port,
+            offers=station.offers,
+            history=JournalHistory(runs),
+        )
+    except OSError as fault:
+        raise CommandError(2, f"port {options.page_port}: {fault.strerror}; choose another with --page-port") from fault
+    station.door = _doors(station.directory, page)
+    try:
+        print(f"page: {page.url}\nCtrl-C ends it", flush=True)
+        await stop.wait()
+        await station.close()
+    finally:
+        await page.close()
+
+
+def _doors(directory: Directory, page: Page) -> Any:
+    from coordinator.door_file import Door
+
+    return lambda run: Door(run, page.base, page.token, os.getpid(), str(directory.source.resolve()))
+
+
+def _nodes(directory: Directory, runs: Path, options: argparse.Namespace) -> AbstractAsyncContextManager[Any]:
+    if not options.up:
+        return nullcontext()
+    from coordinator.launch import local_programs
+    from coordinator.supervisor import Supervisor
+
+    return Supervisor(local_programs(directory, mock=options.mock), runs / "logs", notice=print)

@@ -1,0 +1,144 @@
+"""One mission run in real time under a station: its journal, its connections to the nodes, its operators, its result."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import shutil
+import time
+from collections.abc import Callable, Collection, Mapping
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+from coordinator.controls import Answer, Controls
+from coordinator.door_file import Door, door_open
+from coordinator.engine import SetBreakpoints
+from coordinator.hmi.feed import Feed
+from coordinator.journal import JournalWriter
+from coordinator.launch import Setting, mission_id, realtime_mission, with_runs
+from coordinator.mission import MissionError
+from coordinator.operation import Operation
+from coordinator.partners import FirstAlternative
+from coordinator.realtime import RealtimeMission, credentials_of
+from coordinator.recording import JournalStore, clock_reading
+from coordinator.runfolder import JOURNAL, RESULT, header
+from coordinator.task import Task
+from services.comm.directory import Directory
+
+SEED = 1
+
+
+class MissionRun:
+    """Connect, lead, finish; or discard when the nodes are not there."""
+
+    def __init__(
+        self,
+        directory: Directory,
+        task: Task,
+        text: str,
+        parameters: Mapping[str, Any],
+        selector: FirstAlternative,
+        runs: Path,
+        mock: Path | None = None,
+    ) -> None:
+        """`text` is the task file's, `runs` the folder in which the run gets a folder of its own."""
+        self.identity = mission_id(task)
+        self.folder = runs / self.identity
+        self._selector = selector
+        setting = Setting(task, parameters, None, SEED, selector)
+        now = asyncio.get_running_loop().time()
+        self._store = _store(directory, setting, text, self.folder, self.identity, now, mock)
+        mission = realtime_mission(directory, setting, self.identity, self._store)
+        self._shell = RealtimeMission(mission, directory, credentials_of(directory))
+        self._operation: Operation | None = None
+        self._door: Door | None = None
+        self._stops: tuple[str, ...] = ()
+        self._closing: asyncio.Task[None] | None = None
+
+    async def connect(self) -> None:
+        """Reach every node. Raises UnreachableError."""
+        await self._shell.connect()
+
+    def discard(self) -> None:
+        """It never began: leave no trace."""
+        self._closing = asyncio.get_running_loop().create_task(self._shell.close())
+        self._store.writer.close()
+        shutil.rmtree(self.folder)
+
+    def lead(
+        self, feed: Feed, controls: Controls, door: Callable[[str], Door] | None, stops: Collection[str] = ()
+    ) -> None:
+        """Tell it on a feed and let the holder of the controls steer it; `stops` are breakpoints from the beginning."""
+        self._operation = Operation(self._shell, self._selector, feed, controls, starts=True)
+        self._door = door(self.identity) if door is not None else None
+        self._stops = tuple(sorted(stops))
+        for primitive, selector in list(feed.state["selectors"].items()):
+            if (choice := self._selector.overridden(primitive)) is not None:
+                feed.emit("selector", name=primitive, selector={**selector, "override": choice})
+
+    async def command(self, who: str, verb: str, data: Mapping[str, Any]) -> Answer:
+        """Carry out an operator's command."""
+        assert self._operation is not None
+        return await self._operation.command(who, verb, data)
+
+    def abort(self, reason: str) -> None:
+        """Give it up, whoever holds the controls."""
+        assert self._operation is not None
+        self._operation.abort(reason)
+
+    async def finish(self) -> None:
+        """Run it to its end; its result is left beside its journal and told."""
+        assert self._operation is not None
+        feed, begun = self._operation.feed, time.perf_counter()
+        try:
+            with door_open(self.folder, self._door) if self._door is not None else nullcontext():
+                await self._shell.run(self._begin)
+        except MissionError as fault:
+            feed.emit("mission", mission={"state": "error", "reason": str(fault)})
+            feed.emit("notice", notice={"level": "error", "text": str(fault), "at": feed.state["time"]})
+        finally:
+            await self._operation.close()
+            await self._shell.close()
+            self._store.writer.close()
+        result = self._shell.mission.result("realtime", time.perf_counter() - begun)
+        text = json.dumps(result, indent=2, ensure_ascii=False) + "\n"
+        await asyncio.to_thread((self.folder / RESULT).write_text, text, encoding="utf-8")
+        feed.emit("result", result=result)
+
+    def _begin(self, now: float) -> None:
+        if self._stops:
+            self._shell.mission.executor.stimulate(now, SetBreakpoints(self._stops))
+        self._shell.mission.start(now)
+
+
+def given_parameters(task: Task, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Parameters that a client gave, in the task's own types. Raises ValueError that names what does not fit."""
+    made = {}
+    for name, value in given.items():
+        if name not in task.parameters:
+            raise ValueError(f"{task.name} has no parameter {name!r}; it has: {', '.join(task.parameters) or 'none'}")
+        kind = type(task.parameters[name])
+        if kind is float and type(value) is int:
+            value = float(value)
+        if type(value) is not kind:
+            raise ValueError(f"parameter {name}: {value!r} is no {kind.__name__}")
+        made[name] = value
+    return made
+
+
+def _store(
+    directory: Directory, setting: Setting, text: str, folder: Path, mission: str, origin: float, mock: Path | None
+) -> JournalStore:
+    given: dict[str, Any] = {
+        "services_path": str(directory.source.resolve()),
+        "seed": setting.seed,
+        "runs": with_runs(setting.task, setting.runs)[1],
+        "parameters": {**setting.task.parameters, **setting.parameters},
+        "clock": clock_reading(origin),
+        "durable": False,
+        "mock": str(mock.resolve()) if mock else "",
+        "chosen": {},
+    }
+    services = directory.source.read_text(encoding="utf-8")
+    return JournalStore(JournalWriter(folder / JOURNAL, header(mission, text, services, "realtime", given)), origin)

@@ -1,0 +1,315 @@
+"""A coordinator that stays: one page over any number of mission runs, idle until the operator starts one.
+
+Implements `coordinator.hmi.port.MissionPort`. The feed and who holds the controls outlive each run; a run in real time is led by
+`coordinator.operation.Operation`, one by chance alone by `coordinator.rehearsal.Rehearsal`. What is idle is looked after here:
+which nodes are up, breakpoints and choices for the next run, and the emergency stop.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Protocol
+
+from coordinator.asking import ask_all
+from coordinator.controls import Answer, Controls, refusal
+from coordinator.door_file import Door
+from coordinator.emergency import CLEAR, STOP, order_all
+from coordinator.hmi import verdicts
+from coordinator.hmi.feed import Feed
+from coordinator.hmi.narrator import Narrator
+from coordinator.hmi.store import StoreError, TaskStore, TaskText
+from coordinator.mission_run import MissionRun, given_parameters
+from coordinator.partners import FirstAlternative
+from coordinator.realtime import UnreachableError, credentials_of
+from coordinator.task import Task
+from coordinator.taskfile import TaskFileError, loads
+from coordinator.watching import shown_selectors
+from services.comm.directory import Directory
+
+LOOK, PATIENCE = 2.0, 1.5
+"""Seconds between questions to idle nodes, and for their answers."""
+LAST_WORDS = 10.0
+"""Seconds that a run has to end when the station closes."""
+FAULTS_TOLD = 3
+OVER = frozenset({"success", "failure", "error", "aborted", "stopped"})
+"""States of a mission run that has ended."""
+
+
+class Run(Protocol):
+    """A mission run that goes on, whatever leads it."""
+
+    async def command(self, who: str, verb: str, data: Mapping[str, Any]) -> Answer:
+        """Carry out a command."""
+
+    def abort(self, reason: str) -> None:
+        """Give it up, whoever holds the controls."""
+
+    async def finish(self) -> None:
+        """Lead it to its end and leave everything in good order."""
+
+
+class Station:
+    """One cell's coordinator; `runs` is where journals are kept, `door` gives the address that each run leaves in its folder."""
+
+    def __init__(self, directory: Directory, tasks: TaskStore, runs: Path, mock: Path | None = None) -> None:
+        self.directory = directory
+        self.feed = Feed()
+        self.controls = Controls(self.feed)
+        self.door: Callable[[str], Door] | None = None
+        self._tasks = tasks
+        self._runs = runs
+        self._mock = mock
+        self._loaded = ""
+        self._stops: set[str] = set()
+        self._choices: dict[str, str] = {}
+        self._nodes: Mapping[str, Any] = {}
+        self._run: Run | None = None
+        self._starting = False
+        self._going: asyncio.Task[None] | None = None
+        self._looking = asyncio.get_running_loop().create_task(self._look())
+        self.feed.replace(mission={"id": "", "state": "idle", "mode": "realtime", "starts": True})
+
+    async def close(self) -> None:
+        """Abort the run that goes on and leave."""
+        self._looking.cancel()
+        await asyncio.gather(self._looking, return_exceptions=True)
+        going, run = self._going, self._run
+        if going is None or run is None:
+            return
+        run.abort("petrobot is told to end")
+        _, late = await asyncio.wait({going}, timeout=LAST_WORDS)
+        for task in late:
+            task.cancel()
+        await asyncio.gather(going, return_exceptions=True)
+
+    # --- the port --------------------------------------------------------------------------------------------------
+
+    def snapshot(self) -> dict[str, Any]:
+        """The state now."""
+        return self.feed.snapshot()
+
+    def subscribe(self, receive: Callable[[dict[str, Any]], None]) -> Callable[[], None]:
+        """Give every later change to `receive`."""
+        return self.feed.subscribe(receive)
+
+    async def command(self, who: str, verb: str, data: Mapping[str, Any]) -> Answer:
+        """Carry out a command, the run's own by the run."""
+        answer = self.controls.fault(who, verb) or self.controls.carry_out(who, verb, data)
+        if answer is not None:
+            return answer
+        if verb in ("start", "load"):
+            return await self._guarded(self._start if verb == "start" else self._load, verb, who, data)
+        if self._run is not None:
+            return await self._run.command(who, verb, data)
+        idle: dict[str, Callable[[str, Mapping[str, Any]], Awaitable[Answer]]] = {
+            "breakpoint": self._breakpoint,
+            "override_selector": self._override,
+            "estop": self._estop,
+            "clear_estop": self._clear_estop,
+        }
+        if verb not in idle:
+            return refusal("idle", "no mission run goes on: choose a task and start it")
+        return await self._guarded(idle[verb], verb, who, data)
+
+    async def _guarded(
+        self,
+        carry_out: Callable[[str, Mapping[str, Any]], Awaitable[Answer]],
+        verb: str,
+        who: str,
+        data: Mapping[str, Any],
+    ) -> Answer:
+        try:
+            return await carry_out(who, data)
+        except (KeyError, TypeError, ValueError) as fault:
+            return refusal("bad_data", f"{verb}: {fault}")
+
+    def offers(self) -> Sequence[Mapping[str, Any]]:
+        """Every action that services.toml places, and whether its node is up and says that it offers it."""
+        return offered(self.directory, lambda action, node: action in self._nodes.get(node, {}).get("offers", ()))
+
+    # --- a task, and a run of it -----------------------------------------------------------------------------------
+
+    async def _load(self, who: str, data: Mapping[str, Any]) -> Answer:
+        """Show a task at its initial marking, to look at it and set breakpoints before it is started."""
+        if self._busy:
+            return self._busy_answer()
+        try:
+            text = self._tasks.read(str(data["task"]))
+            task = loads(text.text, f"{text.name}.toml")
+        except (StoreError, TaskFileError) as fault:
+            return refusal("task", str(fault))
+        self._forget(text.name)
+        self._narrator(task).begin("", "realtime", **self._kept(task))
+        return {"ok": True}
+
+    async def _start(self, who: str, data: Mapping[str, Any]) -> Answer:
+        if self._going is not None and self.feed.state["mission"]["state"] in OVER:
+            await asyncio.wait({self._going}, timeout=LAST_WORDS)  # it only hangs up yet
+        if self._busy:
+            return self._busy_answer()
+        self._starting = True  # nobody else may come in between
+        try:
+            return await self._started(who, data)
+        finally:
+            self._starting = False
+
+    @property
+    def _busy(self) -> bool:
+        return self._starting or self._run is not None
+
+    def _busy_answer(self) -> Answer:
+        mission = self.feed.state["mission"]
+        return refusal("running", f"{mission['id'] or 'a mission run'} goes on; abort it, or wait for its end")
+
+    async def _started(self, who: str, data: Mapping[str, Any]) -> Answer:
+        name = str(data.get("task") or self._loaded)
+        if not name:
+            return refusal("task", "choose a task first")
+        try:
+            text = self._tasks.read(name)
+            task = loads(text.text, f"{name}.toml")
+        except (StoreError, TaskFileError) as fault:
+            return refusal("faults", str(fault))
+        if (faulty := await self._faults(text)) is not None:
+            return faulty
+        if name != self._loaded:
+            self._forget(name)
+        parameters = given_parameters(task, data.get("parameters") or {})
+        return await self._live(task, text.text, parameters)
+
+    async def _faults(self, text: TaskText) -> Answer | None:
+        """Why a task may not run: what the check finds."""
+        where = {action: entry.node for action, entry in self.directory.actions.items()}
+        found = await asyncio.to_thread(verdicts.findings, text.text, f"{text.name}.toml", where)
+        faults = [finding for finding in found if finding["severity"] == "error"]
+        if not faults:
+            return None
+        told = "; ".join(f"{f['key']}: {f['text']}" for f in faults[:FAULTS_TOLD])
+        more = f"; and {len(faults) - FAULTS_TOLD} more" if len(faults) > FAULTS_TOLD else ""
+        return {**refusal("faults", f"{text.name} may not run: {told}{more}"), "findings": faults}
+
+    async def _live(self, task: Task, text: str, parameters: Mapping[str, Any]) -> Answer:
+        selector = FirstAlternative()
+        for primitive, action in self._choices.items():
+            selector.override(primitive, action)
+        run = MissionRun(self.directory, task, text, parameters, selector, self._runs, self._mock)
+        try:
+            await run.connect()
+        except UnreachableError as fault:
+            run.discard()
+            return {**refusal("unreachable", str(fault)), "nodes": list(fault.nodes)}
+        run.lead(self.feed, self.controls, self.door, self._stops)
+        self._follow(run)
+        return {"ok": True, "run": run.identity}
+
+    def _follow(self, run: Run) -> None:
+        self._run = run
+        self._going = asyncio.get_running_loop().create_task(self._to_its_end(run))
+
+    async def _to_its_end(self, run: Run) -> None:
+        try:
+            await run.finish()
+        except Exception as fault:  # a run that breaks must not take the station with it
+            reason = f"{type(fault).__name__}: {fault}"
+            self.feed.emit("mission", mission={"state": "error", "reason": reason})
+            notice = {"level": "error", "text": f"the mission run broke: {reason}", "at": self.feed.state["time"]}
+            self.feed.emit("notice", notice=notice)
+        finally:
+            self._run = self._going = None
+
+    def _narrator(self, task: Task) -> Narrator:
+        return Narrator(self.feed, task, {a: entry.node for a, entry in self.directory.actions.items()})
+
+    def _kept(self, task: Task) -> dict[str, Any]:
+        """Parts of the snapshot that outlive a mission run."""
+        nodes = dict(self.feed.state["nodes"])
+        selectors = shown_selectors(task, FirstAlternative())
+        return {"nodes": nodes, "controls": self.controls.plain(), "selectors": selectors}
+
+    # --- what may be said while idle ---------------------------------------------------------------------------------
+
+    def _forget(self, name: str) -> None:
+        self._loaded = name
+        self._stops, self._choices = set(), {}
+
+    async def _breakpoint(self, who: str, data: Mapping[str, Any]) -> Answer:
+        """Breakpoints for the next run."""
+        table, _, name = str(data["element"]).partition(".")
+        drawn = (self.feed.state["task"] or {}).get(table, ())
+        if name not in {element["name"] for element in drawn}:
+            return refusal("refused", f"no {data['element']} in the task")
+        (self._stops.add if data.get("on", True) else self._stops.discard)(name)
+        places = {place["name"] for place in self.feed.state["task"]["places"]}
+        named = [f"{'places' if stop in places else 'transitions'}.{stop}" for stop in sorted(self._stops)]
+        self.feed.emit("breakpoints", breakpoints=named)
+        return {"ok": True}
+
+    async def _override(self, who: str, data: Mapping[str, Any]) -> Answer:
+        """Choices for the next run."""
+        name, action = str(data["primitive_task"]), data.get("action")
+        known = self.feed.state["selectors"].get(name)
+        if known is None or (action is not None and action not in {a["action"] for a in known["alternatives"]}):
+            return refusal("refused", f"{action or name} is no alternative of {name}")
+        self._choices.pop(name, None)
+        if action is not None:
+            self._choices[name] = str(action)
+        self.feed.emit("selector", name=name, selector={**known, "override": action})
+        return {"ok": True}
+
+    async def _estop(self, who: str, data: Mapping[str, Any]) -> Answer:
+        self.feed.emit("mission", mission={"state": "stopped", "reason": f"emergency stop by {who}"})
+        return await self._order(STOP)
+
+    async def _clear_estop(self, who: str, data: Mapping[str, Any]) -> Answer:
+        """Devices take orders again; nothing moves by that alone."""
+        answer = await self._order(CLEAR)
+        if self.feed.state["mission"]["state"] == "stopped":
+            self.feed.emit("mission", mission={"state": "idle", "reason": ""})
+        return answer
+
+    async def _order(self, verb: str) -> Answer:
+        """Straight to the nodes that own devices; an answer that is missing is told."""
+        told = await order_all(self.directory, credentials_of(self.directory), verb)
+        missing = [f"{one.node}: {one.bus or one.why or 'no answer'}" for one in told if not one.answered]
+        said = [f"{device} {answer}" for one in told for device, answer in one.devices.items()]
+        if missing:
+            return refusal("unreachable", "; ".join([*missing, *said]))
+        return {"ok": True, "text": ", ".join(said)}
+
+    # --- who is there ------------------------------------------------------------------------------------------------
+
+    async def _look(self) -> None:
+        """Ask the nodes now and then while no run does; the first time at once."""
+        while True:
+            if self._run is None and (self.feed.watched or not self._nodes):
+                await self.look()
+            await asyncio.sleep(LOOK)
+
+    async def look(self) -> None:
+        """Ask every node whether it is up and what it offers."""
+        with suppress(TimeoutError):
+            self._nodes = await ask_all(self.directory, PATIENCE)
+        if self._run is not None:
+            return  # the run tells itself
+        for name, answer in self._nodes.items():
+            state = {"state": "up", "text": ""} if answer["up"] else {"state": "lost", "text": answer.get("why") or ""}
+            if self.feed.state["nodes"].get(name) != state:
+                self.feed.emit("node", name=name, node=state)
+
+
+def offered(directory: Directory, up: Callable[[str, str], bool]) -> list[dict[str, Any]]:
+    """What the designer may choose from: every action of services.toml; `up(action, node)` says whether it is there now."""
+    return [
+        {
+            "action": name,
+            "primitive_task": entry.task,
+            "node": entry.node,
+            "device": entry.device,
+            "args": dict(entry.args),
+            "up": up(name, entry.node),
+        }
+        for name, entry in directory.actions.items()
+    ]

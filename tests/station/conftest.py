@@ -1,0 +1,199 @@
+"""A station over two nodes of this process, with actions that follow a script."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import AsyncIterator, Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest_asyncio
+
+from coordinator.hmi.store import TaskStore
+from coordinator.station import Station
+from services.comm.directory import Directory, parse
+from services.comm.server import Server
+from services.node import GENERAL, Node
+from services.place import InlinePlace
+from services.scripted import load
+
+SERVICES = """\
+schema = 1
+[nodes.vision]
+host = "127.0.0.1"
+port = {0}
+[nodes.arm]
+host = "127.0.0.1"
+port = {1}
+[actions.look_at_table]
+run = "tests.station.toys:move"
+task = "look"
+node = "vision"
+args = {{ patience = 2.0 }}
+[actions.look_twice]
+run = "tests.station.toys:move"
+task = "look"
+node = "vision"
+[actions.pick_part]
+run = "tests.station.toys:move"
+task = "pick"
+node = "arm"
+[actions.put_part]
+run = "tests.station.toys:move"
+task = "put"
+node = "arm"
+"""
+SCRIPT = """\
+schema = 1
+[actions.look_at_table]
+seconds = 0.05
+[actions.look_twice]
+seconds = 0.05
+[[actions.pick_part]]
+status = "error"
+cause = "slipped"
+text = "the part slipped out of the gripper"
+seconds = 0.05
+[[actions.pick_part]]
+seconds = 0.05
+[actions.put_part]
+seconds = 0.05
+"""
+TASK = """\
+schema = 1
+[task]
+name = "moving"
+goal = "every part has been looked at and picked"
+final = "jobs == 0 and arm_free == 1"
+runs_place = "jobs"
+[primitive_tasks.look]
+goal = "seen"
+alternatives = ["look_at_table", "look_twice"]
+deadline = 5.0
+[primitive_tasks.pick]
+goal = "picked"
+alternatives = ["pick_part"]
+deadline = 5.0
+[task.parameters]
+speed = 0.5
+[places.jobs]
+kind = "control"
+tokens = 2
+capacity = 9
+[places.arm_free]
+kind = "resource"
+tokens = 1
+capacity = 1
+[places.look]
+kind = "action"
+task = "look"
+[places.pick]
+kind = "action"
+task = "pick"
+[transitions.begin]
+in = ["jobs", "arm_free"]
+out = ["look"]
+[transitions.seen]
+in = ["look:normal"]
+out = ["pick"]
+[transitions.unseen]
+in = ["look:error"]
+out = ["arm_free"]
+[transitions.picked]
+in = ["pick:normal"]
+out = ["arm_free"]
+[transitions.slipped]
+in = ["pick:error"]
+out = ["arm_free"]
+"""
+
+
+class ToyNode:
+    """A node, in this loop."""
+
+    def __init__(self, directory: Directory, name: str, script: Mapping[str, Callable[..., Any]]) -> None:
+        clock = asyncio.get_running_loop().time
+        place = InlinePlace(directory.actions, clock=clock, substitutes=script)
+        self.node = Node(directory, name, boot=f"{name} 1", clock=clock, places={GENERAL: place})
+        self.server = Server(self.node.callee, on_orders=self.node.obey)
+        self._address = directory.address(name)
+        self._pump: asyncio.Task[None] | None = None
+
+    async def start(self) -> None:
+        """Listen, and do what is due every 4 ms."""
+        await self.server.start(*self._address)
+        self._pump = asyncio.create_task(self._advance())
+
+    async def _advance(self) -> None:
+        while True:
+            self.node.advance(self.server.now())
+            self.server.flush()
+            await asyncio.sleep(0.004)
+
+    async def close(self) -> None:
+        """Leave."""
+        if self._pump is not None:
+            self._pump.cancel()
+            await asyncio.gather(self._pump, return_exceptions=True)
+        await self.server.close()
+
+
+class Cell:
+    """A station, its nodes, and one operator."""
+
+    def __init__(self, folder: Path) -> None:
+        path = folder / "services.toml"
+        path.write_text(SERVICES.format(*_free_ports()), encoding="utf-8")
+        (folder / "script.toml").write_text(SCRIPT, encoding="utf-8")
+        script = load(folder / "script.toml")
+        self.directory = parse(path.read_text(encoding="utf-8"), path)
+        self.nodes = {name: ToyNode(self.directory, name, script) for name in self.directory.nodes}
+        self.tasks = TaskStore(folder / "tasks")
+        self.tasks.save_text("moving", None, TASK)
+        self.runs = folder / "runs"
+        self.station = Station(self.directory, self.tasks, self.runs)
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """What clients see."""
+        return self.station.feed.state
+
+    async def say(self, verb: str, **data: Any) -> dict[str, Any]:
+        """A command by the operator."""
+        return await self.station.command("ana", verb, data)
+
+    async def until(self, holds: Callable[[], bool], timeout: float = 20.0) -> None:
+        """Wait until something holds."""
+        async with asyncio.timeout(timeout):
+            while not holds():
+                await asyncio.sleep(0.002)
+
+    async def ended(self) -> Mapping[str, Any]:
+        """Wait for the run's end; its result."""
+        await self.until(lambda: self.state["result"] is not None)
+        return self.state["result"]  # type: ignore[no-any-return]
+
+
+def _free_ports() -> list[int]:
+    probes = [socket.socket() for _ in range(2)]
+    for probe in probes:
+        probe.bind(("127.0.0.1", 0))
+    ports = [probe.getsockname()[1] for probe in probes]
+    for probe in probes:
+        probe.close()
+    return ports
+
+
+@pytest_asyncio.fixture
+async def cell(tmp_path: Path) -> AsyncIterator[Cell]:
+    """A cell whose nodes are up, with an operator who holds the controls."""
+    made = Cell(tmp_path)
+    for node in made.nodes.values():
+        await node.start()
+    await made.station.look()
+    await made.say("take_controls")
+    yield made
+    await made.station.close()
+    for node in made.nodes.values():
+        await node.close()
