@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -13,7 +12,6 @@ from hypothesis import given, settings
 from coordinator.analysis.formats import read_net, written
 from coordinator.analysis.greatspn import parse_pnpro
 from coordinator.analysis.gspn import Chain, Gspn
-from coordinator.analysis.markov import long_run
 from coordinator.analysis.netfile import FormatError, NetFile
 from coordinator.analysis.pnml_reading import parse_pnml
 from coordinator.analysis.pnml_writing import losses, write_pnml
@@ -329,31 +327,6 @@ def test_dot_and_drn() -> None:
 def test_a_net_without_namespace_stays_readable_xml() -> None:
     text = write_pnml(parse_pnml(arc_file("")))
     assert ElementTree.fromstring(text).tag == "pnml" and "ns0" not in write_pnml(parse_pnml(ISO))
-
-
-# Independent readers, where they are installed (`pip install petrobot[oracles]`).
-
-
-def test_pm4py_reads_what_we_write(tmp_path: Path) -> None:
-    pm4py = pytest.importorskip("pm4py")
-    path = tmp_path / "kanban.pnml"
-    path.write_text(write_pnml(NetFile(kanban(2))), encoding="utf-8")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        net, initial, _ = pm4py.read_pnml(str(path), auto_guess_final_marking=False)
-    assert len(net.places) == 16 and len(net.arcs) == sum(map(len, (*kanban(2).consume, *kanban(2).produce)))
-    assert sorted(initial.values()) == [2, 2, 2, 2]
-
-
-def test_storm_reads_what_we_write_and_agrees(tmp_path: Path) -> None:
-    stormpy = pytest.importorskip("stormpy")
-    gspn = Gspn.of(kanban(1), KANBAN_RATES)
-    path = tmp_path / "kanban.drn"
-    path.write_text(written(NetFile(gspn.net, gspn=gspn), ".drn")[0], encoding="utf-8")
-    model = stormpy.build_model_from_drn(str(path))
-    (formula,) = stormpy.parse_properties('LRA=? [ "pkan1" ]')
-    found = stormpy.model_checking(model, formula).get_value(0)
-    assert long_run(Chain.of(gspn)).occupancy["pkan1"] == pytest.approx(found, abs=1e-5)
 
 
 def test_entities_are_refused() -> None:

@@ -1,0 +1,100 @@
+"""Other tools as judges of ours (`pip install petrobot[oracle]`): SNAKES, pm4py and Storm count and solve the same nets."""
+
+from __future__ import annotations
+
+import tempfile
+import warnings
+from pathlib import Path
+from typing import Any
+
+from coordinator.net import Net
+
+
+def snakes_graph(net: Net, most: int) -> tuple[set[tuple[int, ...]], int] | None:
+    """Markings and number of edges by SNAKES 0.9; None if there are more than `most` markings."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return _snakes_graph(net, most)
+
+
+def _snakes_graph(net: Net, most: int) -> tuple[set[tuple[int, ...]], int] | None:
+    from snakes.nets import (  # type: ignore[import-not-found]
+        Inhibitor,
+        MultiArc,
+        PetriNet,
+        Place,
+        StateGraph,
+        Transition,
+        Value,
+        dot,
+    )
+
+    model = PetriNet("net")
+    for place, tokens in zip(net.places, net.initial, strict=True):
+        model.add_place(Place(place, [dot] * tokens))
+    for t, name in enumerate(net.transitions):
+        model.add_transition(Transition(name))
+        for arcs, add in ((net.consume[t], model.add_input), (net.produce[t], model.add_output)):
+            for p, w in arcs:
+                add(net.places[p], name, Value(dot) if w == 1 else MultiArc([Value(dot)] * w))
+        for p, threshold in net.inhibit[t]:
+            assert threshold == 1, "an inhibitor of SNAKES looks for one token"
+            model.add_input(net.places[p], name, Inhibitor(Value(dot)))
+    graph = StateGraph(model)
+    for _ in graph:
+        if len(graph) > most:
+            return None
+    markings = set()
+    edges = 0
+    for state in graph:
+        marking = graph.net.get_marking() if graph.goto(state) is None else {}
+        markings.add(tuple(len(marking.get(place, ())) for place in net.places))
+        edges += len(list(graph.successors(state)))
+    return markings, edges
+
+
+def pm4py_markings(text: str, net: Net) -> set[tuple[int, ...]]:
+    """The markings that pm4py reaches in a PNML text, by its own reader and firing rule."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import pm4py  # type: ignore[import-not-found]
+        from pm4py.objects.petri_net import semantics  # type: ignore[import-not-found]
+
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "net.pnml"
+            path.write_text(text, encoding="utf-8")
+            model, first, _ = pm4py.read_pnml(str(path), auto_guess_final_marking=False)
+    seen, queue = {first}, [first]
+    while queue:
+        marking = queue.pop()
+        for transition in semantics.enabled_transitions(model, marking):
+            after = semantics.weak_execute(transition, marking)
+            if after not in seen:
+                seen.add(after)
+                queue.append(after)
+    by_name = {place.name: place for place in model.places}
+    return {tuple(marking[by_name[place]] if place in by_name else 0 for place in net.places) for marking in seen}
+
+
+def storm_share(text: str, label: str) -> float:
+    """The long-run share of time in states with a label, by Storm, of a chain in its explicit format (.drn)."""
+    import stormpy  # type: ignore[import-not-found]
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "chain.drn"
+        path.write_text(text, encoding="utf-8")
+        model: Any = stormpy.build_model_from_drn(str(path))
+    (formula,) = stormpy.parse_properties(f'LRA=? [ "{label}" ]')
+    return float(stormpy.model_checking(model, formula).at(model.initial_states[0]))
+
+
+def storm_time(text: str, label: str) -> float:
+    """Mean time (s) until a state with a label, by Storm, of a chain in its explicit format (.drn)."""
+    import stormpy
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "chain.drn"
+        path.write_text(text, encoding="utf-8")
+        model: Any = stormpy.build_model_from_drn(str(path))
+    (formula,) = stormpy.parse_properties(f'T=? [ F "{label}" ]')
+    return float(stormpy.model_checking(model, formula).at(model.initial_states[0]))

@@ -1,0 +1,108 @@
+"""Three independent tools agree with us on random nets, each where it is installed (`pip install petrobot[oracle]`)."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
+
+from coordinator.analysis.completion import completion
+from coordinator.analysis.formats import written
+from coordinator.analysis.gspn import Chain, Gspn
+from coordinator.analysis.markov import long_run
+from coordinator.analysis.netfile import NetFile
+from coordinator.analysis.pnml_writing import write_pnml
+from coordinator.analysis.space import Limits, explore
+from coordinator.net import Net
+from tests.analysis import oracles
+from tests.analysis.generators import kanban, philosophers
+from tests.analysis.random_nets import brute_force, nets, state_machines
+from tests.analysis.test_markov import KANBAN_RATES
+
+MOST = 200
+RANDOM = settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+
+
+@pytest.fixture(scope="module")
+def snakes() -> None:
+    """SNAKES is there."""
+    pytest.importorskip("snakes", reason="the extra `oracle` (SNAKES) is not installed")
+
+
+@pytest.fixture(scope="module")
+def pm4py() -> None:
+    """pm4py is there."""
+    pytest.importorskip("pm4py", reason="the extra `oracle` (pm4py) is not installed")
+
+
+@pytest.fixture(scope="module")
+def storm() -> None:
+    """Storm is there."""
+    pytest.importorskip("stormpy", reason="the extra `oracle` (stormpy) is not installed")
+
+
+def ours(net: Net) -> tuple[set[tuple[int, ...]], int]:
+    """Markings and number of edges that differ."""
+    space = explore(net, limits=Limits(states=10 * MOST))
+    assert space.complete
+    edges = set(zip(space.source.tolist(), space.label.tolist(), strict=True))
+    return {space.marking(i) for i in range(len(space))}, len(edges)
+
+
+@RANDOM
+@given(nets(inhibitors=False, capacities=False, priorities=False))
+def test_snakes_reaches_the_same_markings(snakes: None, net: Net) -> None:
+    """Weighted arcs: the same markings and as many firings between them (SNAKES never fires what consumes nothing)."""
+    assume(all(net.consume))
+    assume(brute_force(net, MOST) is not None)
+    assert oracles.snakes_graph(net, 10 * MOST) == ours(net)
+
+
+@RANDOM
+@given(state_machines(), st.data())
+def test_snakes_with_inhibitors(snakes: None, net: Net, data: st.DataObject) -> None:
+    """Inhibitor arcs that look for one token."""
+    arcs = {t: ({net.places[p]: w for p, w in net.consume[i]}, {net.places[p]: w for p, w in net.produce[i]})
+            for i, t in enumerate(net.transitions)}  # fmt: skip
+    free = {t: [p for p in net.places if p not in arcs[t][0]] for t in net.transitions}
+    inhibitors = {t: {data.draw(st.sampled_from(places)): 1} for t, places in free.items() if places}
+    barred = Net.build(dict(zip(net.places, net.initial, strict=True)), arcs, inhibitors=inhibitors)
+    assert oracles.snakes_graph(barred, 10 * MOST) == ours(barred)
+
+
+@RANDOM
+@given(nets(inhibitors=False, capacities=False, priorities=False))
+def test_pm4py_reads_what_we_write_and_reaches_the_same(pm4py: None, net: Net) -> None:
+    """Through our PNML: its reader and its firing rule."""
+    assume(brute_force(net, MOST) is not None)
+    assert oracles.pm4py_markings(write_pnml(NetFile(net)), net) == ours(net)[0]
+
+
+@pytest.mark.parametrize("net", [kanban(1), philosophers(5)], ids=["kanban", "philosophers"])
+def test_pm4py_on_known_nets(pm4py: None, net: Net) -> None:
+    """The generated nets of the bench."""
+    assert oracles.pm4py_markings(write_pnml(NetFile(net)), net) == ours(net)[0]
+
+
+def test_storm_reads_what_we_write_and_agrees(storm: None) -> None:
+    """Through our .drn: its long-run shares are ours."""
+    gspn = Gspn.of(kanban(1), KANBAN_RATES)
+    text = written(NetFile(gspn.net, gspn=gspn), ".drn")[0]
+    for label in ("pkan1", "pm1", "pout4"):
+        share = oracles.storm_share(text, label)
+        assert long_run(Chain.of(gspn)).occupancy[label] == pytest.approx(share, abs=1e-5)
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
+@given(st.integers(1, 6), st.lists(st.floats(0.2, 5.0), min_size=2, max_size=5))
+def test_storm_agrees_on_times(storm: None, tokens: int, rates: list[float]) -> None:
+    """Mean time until all jobs have gone through a line of machines, solved by Storm, against our completion."""
+    names = [f"p{i}" for i in range(len(rates) + 1)]
+    arcs = {f"t{i}": ({names[i]: 1}, {names[i + 1]: 1}) for i in range(len(rates))}
+    arcs["all"] = ({names[-1]: tokens}, {"done": 1})
+    net = Net.build({**dict.fromkeys(names, 0), names[0]: tokens, "done": 0}, arcs)
+    gspn = Gspn.of(net, {**{f"t{i}": rate for i, rate in enumerate(rates)}, "all": 3.0})
+    chain = Chain.of(gspn)
+    text = written(NetFile(net, gspn=gspn), ".drn")[0]
+    done = chain.space.where(lambda m: m[net.place_index["done"]] > 0)
+    assert completion(chain, done).mean == pytest.approx(oracles.storm_time(text, "done"), rel=1e-4)
