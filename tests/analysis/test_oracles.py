@@ -15,9 +15,8 @@ from coordinator.analysis.pnml_writing import write_pnml
 from coordinator.analysis.space import Limits, explore
 from coordinator.net import Net
 from tests.analysis import oracles
-from tests.analysis.generators import kanban, philosophers
+from tests.analysis.generators import KANBAN_RATES, kanban, philosophers
 from tests.analysis.random_nets import brute_force, nets, state_machines
-from tests.analysis.test_markov import KANBAN_RATES
 
 MOST = 200
 RANDOM = settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
