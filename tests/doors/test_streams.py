@@ -45,7 +45,7 @@ class GuardedOperator(Operator):
 
 
 @pytest.mark.processes
-@pytest.mark.parametrize("how", ["shared key", "certificates"])
+@pytest.mark.parametrize("how", [pytest.param("shared key", marks=pytest.mark.proof), "certificates"])
 async def test_set_points_cross_guarded_nodes(tmp_path: Path, how: str) -> None:
     """An action of one node leads a device of another; a variable of a third call goes over the same doors."""
     if how == "certificates":
