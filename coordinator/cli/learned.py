@@ -1,4 +1,4 @@
-"""Show what was learned; merge estimates files of several machines; freeze, thaw or reset a primitive task."""
+"""Show what was learned, of actions or of a whole task; merge estimates files; freeze, thaw or reset a primitive task."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
 from coordinator.cli.loading import write_json
+from coordinator.cli.propagated import show_task
 
 if TYPE_CHECKING:
     from coordinator.estimates_file import EstimatesFile, Kept
     from coordinator.learning.objective import Comparison, Figures
 
 EXAMPLE = "petrobot learned show learned.db --target 0.95\n  petrobot learned merge learned.db other_machine.db"
-VERBS = ("show", "merge", "freeze", "thaw", "reset")
+VERBS = ("show", "task", "merge", "freeze", "thaw", "reset")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -49,6 +50,8 @@ def run(options: argparse.Namespace) -> int:
         if not options.file.exists():
             raise CommandError(2, f"{options.file}: no such file; `petrobot run ... --learn {options.file}` makes it")
         kept = file.read()
+        if options.verb == "task":
+            return show_task(kept, options)
         _refuse_unknown(kept, options)
         if options.verb == "show":
             return _show(kept, options)

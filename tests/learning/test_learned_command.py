@@ -173,6 +173,24 @@ def test_verbs_of_learned(cell: Path, capsys: pytest.CaptureFixture[str]) -> Non
         assert said in capsys.readouterr().err
 
 
+def test_what_the_actions_come_to_in_the_task(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """R and C of primitive tasks and of the task through its net, for one run of it."""
+    petrobot("--learn", "learned.db", "--selector", "round_robin", runs=30)
+    assert main(["learned", "task", "learned.db", str(TASK_FILE), "--json", "task.json"]) == 0
+    found = json.loads(Path("task.json").read_text(encoding="utf-8"))
+    parts = {p["primitive_task"]: p for p in found["primitive_tasks"]}
+    assert parts["pick"]["R"] == pytest.approx(1 / 3, abs=0.01)
+    assert parts["place"]["runs"] == pytest.approx(1 / 3, abs=0.01)
+    assert found["R_conj"] == pytest.approx(1 / 3, abs=0.01)
+    assert 0 < found["R_goal"] < found["R_conj"], "a jam counts none, yet nothing is placed"
+    assert found["P_complete"] == pytest.approx(1.0)
+    assert found["cost"] is None, "seconds and tries do not add"
+    assert "every run a success" in capsys.readouterr().out
+    assert main(["learned", "task", "learned.db"]) == 2
+    assert main(["learned", "task", "learned.db", "no_such_task"]) == 2
+    assert "which task?" in capsys.readouterr().err
+
+
 def test_a_run_that_was_saved_and_resumed_counts_once(tmp_path: Path) -> None:
     """The session of a recorded run begins as that run began, and adds only what was not saved before."""
     task, path = sorting(), tmp_path / "learned.db"
