@@ -38,6 +38,8 @@ bench: $(VENV)/.ready
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[test,bench]"
 	$(BIN)/python tests/bench/wire.py
 	$(BIN)/python tests/bench/faults.py
+	$(BIN)/python tests/bench/estop.py
+	$(BIN)/python tests/bench/doors.py
 	$(BIN)/python tests/bench/journal.py
 	$(BIN)/python -m tests.bench.analysis
 
