@@ -184,7 +184,7 @@ def _draw_regret(found: dict[str, dict[str, dict[str, Any]]]) -> None:
             style = "--" if name not in RULES else "-"
             ax.plot(MARKS, found[name][world]["curve"], style, color=f"C{i % 10}", label=name, lw=1.2)
         ax.set(title=f"{world}: gap {WORLDS[world].gap:.2g}", xlabel="trial", ylabel="cumulative regret (J)")
-    axes[0, 0].legend(fontsize=7)
+    axes[1, 1].legend(fontsize=7, loc="upper left")
     _save(figure, "learning-regret.svg")
 
 
@@ -214,7 +214,7 @@ def _draw_long(long: dict[str, Any]) -> None:
         left.loglog(run["trials"], np.maximum(run["worst"], 1e-16), ":", color=f"C{i}", label="worst seed")
         right.semilogx(run["trials"], run["least_tries"], color=f"C{i}", label=name)
     left.set(xlabel="trial", ylabel="1 - p of the optimum", ylim=(1e-9, 2))
-    right.set(xlabel="trial", ylabel="tries of the least tried action (median)", yscale="log")
+    right.set(xlabel="trial", ylabel="tries of the least tried action (median)")
     left.legend(fontsize=7)
     right.legend(fontsize=7)
     _save(figure, "learning-million.svg")
