@@ -129,9 +129,16 @@ def _learning(
 
 
 def session_of(task: Task, header: Mapping[str, Any]) -> LearningSession | None:
-    """The session of a recorded run, as it began; None if it did not learn."""
+    """The session of a recorded run, as it began; None if it did not learn. Raises EstimatesError, ValueError."""
     begun = header.get("learning")
-    return None if begun is None else LearningSession(task, LearningSetting.of_plain(begun), header["seed"], begun)
+    if begun is None:
+        return None
+    try:
+        return LearningSession(task, LearningSetting.of_plain(begun), header["seed"], begun)
+    except (KeyError, TypeError) as fault:
+        raise ValueError(
+            f"the journal's header says in `learning` how the run learned, but not all: {fault}"
+        ) from fault
 
 
 def fixed_by_user(header: Mapping[str, Any]) -> Mapping[str, str]:

@@ -216,6 +216,8 @@ def test_a_run_that_was_saved_and_resumed_counts_once(tmp_path: Path) -> None:
     assert kept.states("nikolic_fu_fast") == one.learning.state()
     assert directory(task).actions
     assert session_of(task, {"seed": 5}) is None
+    with pytest.raises(ValueError, match="declared"):
+        session_of(task, {"seed": 5, "learning": {k: v for k, v in header["learning"].items() if k != "declared"}})
     assert Key("pick", "pick_slow", "regime=A") in kept.estimates.tallies
 
 
