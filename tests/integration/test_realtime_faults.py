@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -18,11 +19,14 @@ from coordinator.realtime import RealtimeMission
 from coordinator.supervisor import Supervisor
 from coordinator.task import Executed, Status
 from services.comm.directory import load
+from services.comm.messages import Command
 from services.comm.notice import Progress
 from tests.integration.cell_files import services_file
 
 pytestmark = pytest.mark.processes
 LIMIT = 120.0
+PERIODS = 3
+"""Of the stream, after which the arm must hold."""
 
 
 class When:
@@ -48,8 +52,26 @@ class When:
         """Nothing to do."""
 
 
-async def run_and_kill(folder: Path, place: str, node: str) -> tuple[Mission, list[RunRecorded], Supervisor]:
-    """Two runs over launched nodes; a node is killed (kill -9) when the place is first entered."""
+async def arm_state(shell: RealtimeMission) -> dict[str, Any]:
+    """What the arm's driver says of itself now."""
+    told: asyncio.Future[dict[str, Any]] = asyncio.get_running_loop().create_future()
+
+    def hear(data: Mapping[str, Any]) -> None:
+        if "arm" in data["devices"] and not told.done():
+            told.set_result(data["devices"]["arm"]["state"])
+
+    shell.mission.executor.on_status = hear
+    assert await shell.clients["motion"].connected(30.0)
+    now = asyncio.get_running_loop().time()
+    shell.mission.callers["motion"].command(now, Command("test/status", "status"))
+    shell.clients["motion"].flush(now)
+    return await asyncio.wait_for(told, 10.0)
+
+
+async def run_and_kill(
+    folder: Path, place: str, node: str
+) -> tuple[Mission, list[RunRecorded], Supervisor, dict[str, Any]]:
+    """Two runs over launched nodes; a node is killed (kill -9) when the place is first entered. The arm's state comes last."""
     directory, task = load(services_file(folder)), load_task("catch_ball")
     mission = realtime_mission(directory, Setting(task, runs=2, seed=3), mission_id(task))
     async with Supervisor(local_programs(directory), folder / "logs") as supervisor:
@@ -59,18 +81,20 @@ async def run_and_kill(folder: Path, place: str, node: str) -> tuple[Mission, li
         try:
             await shell.connect(20.0)
             await asyncio.wait_for(shell.run(), LIMIT)
+            arm = await arm_state(shell)
         finally:
             await shell.close()
     assert killer.done
-    return mission, mission.tally.runs, supervisor
+    return mission, mission.tally.runs, supervisor, arm
 
 
 @pytest.mark.parametrize(("place", "node"), [("track_ball", "vision"), ("catch_ball", "motion")])
 async def test_a_node_killed_in_mid_catch_is_an_error_and_the_task_goes_on(
     tmp_path: Path, place: str, node: str
 ) -> None:
-    """kill -9: its run ends in ERROR with executed = unknown and a reason, the node is started again, final is reached."""
-    mission, runs, supervisor = await run_and_kill(tmp_path, place, node)
+    """kill -9: its run ends in ERROR with executed = unknown and a reason, the node is started again, final is reached.
+    Whatever befalls the sender, no set point older than three periods is executed."""
+    mission, runs, supervisor, arm = await run_and_kill(tmp_path, place, node)
     finished = mission.executor.finished
     assert finished is not None
     killed = next(r for r in runs if r.place == place)
@@ -80,6 +104,9 @@ async def test_a_node_killed_in_mid_catch_is_an_error_and_the_task_goes_on(
     assert supervisor.starts(node) == 2
     assert len(mission.tally.cycles) == 2 or finished.status is Status.ERROR
     assert all(r.cause for r in runs if r.status is Status.ERROR)
+    assert arm["stale_executed"] == 0
+    assert arm["oldest_executed"] <= PERIODS * mission.executor.directory.streams["catch_point"].period
+    assert node == "motion" or arm["setpoint_count"] > 0, "a motion node that was killed counts anew"
 
 
 async def test_every_firing_of_a_live_run_is_one_of_the_ordinary_net(tmp_path: Path) -> None:

@@ -1,0 +1,99 @@
+"""The drives are left alone: everything of the motion node is killed in mid-move, and they stop by themselves."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import threading
+import warnings
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+
+from coordinator.launch import local_programs
+from coordinator.supervisor import Supervisor
+from services.comm.cia402 import Fault, State, state_of
+from tests.doors.arm_cell import DRIVES, cell_in, ear_on
+from tests.doors.test_estop import LIMIT, Cell
+
+pytestmark = pytest.mark.processes
+DRIVE_EDS = str(files("services.comm.eds").joinpath("joint_drive.eds"))
+STATUSWORD, ERROR_CODE, POSITION = 0x6041, 0x603F, 0x6064
+
+
+def family(process: int) -> list[int]:
+    """A process and all that it has started, oldest first."""
+    parents: dict[int, list[int]] = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                fields = (entry / "stat").read_text().rpartition(")")[2].split()
+            except OSError:
+                continue  # it has ended meanwhile
+            parents.setdefault(int(fields[1]), []).append(int(entry.name))
+    found = [process]
+    for one in found:
+        found += parents.get(one, [])
+    return found
+
+
+class Bench:
+    """An engineer's laptop on the bus: the canopen package reads the drives by SDO, with no master left to send SYNC."""
+
+    def __init__(self, channel: str) -> None:
+        import canopen
+
+        self._network = canopen.Network()
+        self._network.connect(interface="petrobot_stream", channel=channel)
+        self._drives = {n: self._network.add_node(n, DRIVE_EDS) for n in DRIVES}
+
+    def read(self, index: int) -> list[int]:
+        """An object of every drive."""
+        return [int(self._drives[n].sdo[index].raw) for n in DRIVES]
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._network.disconnect()
+
+
+def left_alone(channel: str) -> tuple[list[State], list[int], list[int], list[int]]:
+    """States and error codes once every drive has faulted, and positions at two times a quarter of a second apart."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the canopen package's own
+        bench = Bench(channel)
+        pause = threading.Event()
+        try:
+            for _ in range(int(LIMIT / 0.05)):
+                states = [state_of(word) for word in bench.read(STATUSWORD)]
+                if all(state is State.FAULT for state in states):
+                    break
+                pause.wait(0.05)
+            codes = bench.read(ERROR_CODE)
+            before = bench.read(POSITION)
+            pause.wait(0.25)
+            return states, codes, before, bench.read(POSITION)
+        finally:
+            bench.close()
+
+
+async def test_drives_stop_by_themselves_when_their_master_is_killed(tmp_path: Path) -> None:
+    """kill -9 of the node, its servo process and its worker in mid-move: heartbeat lost, quick stop, brake; nothing moves."""
+    directory = cell_in(tmp_path)
+    async with Supervisor(local_programs(directory), tmp_path / "logs", respawn=False) as supervisor:
+        with ear_on(directory) as ear:
+            cell = Cell(tmp_path, directory, supervisor, ear)
+            try:
+                await cell.sweep()
+                for process in family(supervisor.process_ids()["motion"]):
+                    os.kill(process, signal.SIGKILL)
+                channel = directory.devices["arm"].config["channel"]
+                states, codes, before, after = await asyncio.to_thread(left_alone, channel)
+            finally:
+                if cell.coordinator is not None:
+                    cell.coordinator.kill()
+                    cell.coordinator.communicate()
+    assert states == [State.FAULT] * len(DRIVES)
+    assert set(codes) <= {Fault.HEARTBEAT, Fault.SYNC_LOST}
+    assert max(abs(a - b) for a, b in zip(before, after, strict=True)) < 200, "0.2 mrad: they stand"
