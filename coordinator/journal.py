@@ -117,7 +117,10 @@ class JournalWriter:
         """Make all that was appended durable; costs nothing if it is already."""
         self.flush()
         if self._unsynced:
-            os.fdatasync(self._file)
+            try:
+                os.fdatasync(self._file)
+            except OSError as fault:
+                raise JournalError(f"{self.path}: {fault.strerror}; nothing was sent on the strength of it") from fault
             self.syncs += 1
             self._unsynced = False
 

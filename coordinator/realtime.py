@@ -5,11 +5,15 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
 
+from coordinator.journal import JournalError
 from coordinator.mission import Mission, MissionError, Stage
 from services.comm.client import Client
 from services.comm.credentials import COORDINATOR, Credentials, credentials
 from services.comm.directory import Directory
 from services.comm.notice import Notice
+
+LINGER = 1.0
+"""Seconds that nothing at the end of a run waits for."""
 
 
 class UnreachableError(Exception):
@@ -27,6 +31,7 @@ class RealtimeMission:
         self.mission = mission
         self._loop = asyncio.get_running_loop()
         self._over = asyncio.Event()
+        self._closed = False
         self._fault: BaseException | None = None
         self._timer: asyncio.TimerHandle | None = None
         key, tls = (proves.key, proves.client()) if proves is not None else (None, None)
@@ -50,7 +55,10 @@ class RealtimeMission:
         return f"{node} at {client.host}:{client.port}" + (f" ({client.trouble})" if client.trouble else "")
 
     async def run(self, begin: Callable[[float], None] | None = None) -> None:
-        """Run the mission to its end, from its start or from whatever `begin(now)` makes of it. Raises MissionError."""
+        """Run the mission to its end, from its start or from whatever `begin(now)` makes of it.
+
+        Raises MissionError, and JournalError when the journal cannot be written.
+        """
         (begin or self.mission.start)(self._loop.time())
         self.settle()
         await self._over.wait()
@@ -59,12 +67,17 @@ class RealtimeMission:
 
     async def close(self) -> None:
         """Leave the nodes in good order."""
+        self._closed = True
         if self._timer is not None:
             self._timer.cancel()
+        for client in self.clients.values():
+            client.flush(self._loop.time() + LINGER)  # acknowledgements that wait for others go now
         await asyncio.gather(*(client.close() for client in self.clients.values()))
 
     def settle(self) -> None:
         """Send what was said, and wake up in time for what is due next; call it after each use of the mission."""
+        if self._closed:
+            return
         for client in self.clients.values():
             client.flush()
         if self.mission.stage is Stage.OVER:
@@ -84,7 +97,8 @@ class RealtimeMission:
     def _guarded(self, step: Callable[[float], None]) -> None:
         try:
             step(self._loop.time())
-        except MissionError as fault:
+        except (MissionError, JournalError) as fault:
+            # What is not safe has not left: the nodes end its runs as orphans, and `resume` goes on from what is.
             self._fault = fault
             self._over.set()
             return

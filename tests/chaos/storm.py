@@ -1,9 +1,9 @@
 """Mission runs in real time while everything around them breaks: `storm.py SEED SECONDS FOLDER [--lo]`. Prints one JSON object.
 
 Nodes live under the supervisor of `petrobot up`, each behind a proxy. Seeded weather kills nodes and workers (SIGKILL), freezes
-them (SIGSTOP), cuts, delays and repeats what goes over the wire, and, in a network namespace of its own (`--lo`), takes the
-loopback down. Mission runs follow one another; each is judged by its journal and by what the hands noted. Last comes one in calm
-weather.
+them (SIGSTOP), cuts, delays and repeats what goes over the wire, drops the coordinator as a crash would (connections aborted, what
+was not written lost), and, in a network namespace of its own (`--lo`), takes the loopback down. Mission runs follow one another,
+resumed after each crash; each is judged by its journal and by what the hands noted. Last comes one in calm weather.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import signal
 import subprocess
 import sys
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,8 +27,8 @@ from coordinator.cli.loading import load_task
 from coordinator.cli.replaying import recorded
 from coordinator.engine import Fired, RunRecorded, StartRun
 from coordinator.journal import JournalWriter
-from coordinator.launch import Setting, local_programs, mission_id, realtime_mission, with_runs
-from coordinator.mission import Mission
+from coordinator.launch import Setting, local_programs, mission_id, realtime_mission, resumed_mission, with_runs
+from coordinator.mission import Mission, Stage
 from coordinator.realtime import RealtimeMission, UnreachableError
 from coordinator.recording import JournalStore, clock_reading
 from coordinator.runfolder import JOURNAL, header
@@ -48,11 +49,25 @@ CALM = "calm"
 class Weather:
     """What breaks, and when: all drawn from a seed."""
 
-    def __init__(self, seed: int, supervisor: Supervisor, proxy: asyncio.subprocess.Process, lo: bool) -> None:
+    def __init__(
+        self, seed: int, supervisor: Supervisor, proxy: asyncio.subprocess.Process, crash: asyncio.Event, lo: bool
+    ) -> None:
+        """`crash` is set when the coordinator shall die."""
+        self._crashing = crash
         self._draw = np.random.default_rng(seed)
         self._supervisor = supervisor
         self._proxy = proxy
-        kinds = ["kill_node", "kill_worker", "freeze_node", "freeze_worker", "cut", "delay", "repeat", "repeat"]
+        kinds = [
+            "kill_node",
+            "kill_worker",
+            "freeze_node",
+            "freeze_worker",
+            "cut",
+            "delay",
+            "repeat",
+            "repeat",
+            "crash",
+        ]
         self._kinds = [*kinds, "lo_down"] if lo else kinds
         self._frozen: set[int] = set()
         self.seen: Counter[str] = Counter()
@@ -97,6 +112,9 @@ class Weather:
     async def _repeat(self) -> None:
         await self._order(f"repeat {self._draw.integers(2)}")
 
+    async def _crash(self) -> None:
+        self._crashing.set()
+
     async def _lo_down(self) -> None:
         _link("down")
         await asyncio.sleep(float(self._draw.uniform(0.1, 2.0)))
@@ -131,7 +149,8 @@ class Storm:
         self._proxied = free_ports(2)
         self._ends: Counter[str] = Counter()
         self._causes: Counter[str] = Counter()
-        self._unreachable = self._calls = 0
+        self._unreachable = self._calls = self._resumes = 0
+        self._crash = asyncio.Event()
         self._faults: list[str] = []
 
     async def pass_over(self, seconds: float) -> dict[str, Any]:
@@ -144,7 +163,7 @@ class Storm:
         await proxy.stdout.readline()
         try:
             async with Supervisor(local_programs(self._directory), self._folder / "logs") as supervisor:
-                weather = Weather(self._seed, supervisor, proxy, self._lo)
+                weather = Weather(self._seed, supervisor, proxy, self._crash, self._lo)
                 loop = asyncio.get_running_loop()
                 before, end = _sockets(), loop.time() + seconds
                 blowing = loop.create_task(weather.blow())
@@ -164,6 +183,7 @@ class Storm:
         return {
             "missions": sum(self._ends.values()),
             "ends": dict(self._ends),
+            "resumed": self._resumes,
             "unreachable": self._unreachable,
             "calls": self._calls,
             "causes": dict(self._causes),
@@ -192,22 +212,56 @@ class Storm:
         folder = self._folder / "runs" / mission_name
         store = JournalStore(JournalWriter(folder / JOURNAL, self._header(mission_name, now)), now)
         setting = Setting(task, runs=RUNS, seed=self._seed)
-        mission = realtime_mission(self._by_proxy(), setting, mission_name, store)
-        shell = RealtimeMission(mission, self._by_proxy())
-        try:
-            await shell.connect(10.0)
-            await asyncio.wait_for(shell.run(), LONGEST)
-        except UnreachableError:
-            self._unreachable += 1
-            return False
-        except TimeoutError:
+        mission, begin = realtime_mission(self._by_proxy(), setting, mission_name, store), None
+        until = now + LONGEST
+        while not await self._life(mission, begin, until):
+            if mission.stage is Stage.CONNECTING and begin is None:
+                return False
+            mission, begin = self._resumed(folder)
+        if mission.stage is not Stage.OVER:
             self._faults.append(f"{mission_name} hangs: {mission.executor.state}")
             return False
-        finally:
-            await shell.close()
-            store.writer.close()
         self._judge(mission, folder)
         return name != CALM or all(r.status is Status.SUCCESS for r in mission.tally.runs)
+
+    async def _life(self, mission: Mission, begin: Callable[[float], None] | None, until: float) -> bool:
+        """One life of the coordinator: False if it crashed, or its nodes were not there."""
+        loop = asyncio.get_running_loop()
+        shell = RealtimeMission(mission, self._by_proxy())
+        self._crash.clear()
+        try:
+            await shell.connect(10.0)
+        except UnreachableError:
+            self._unreachable += 1
+            self._drop_journal(mission)
+            await shell.close()
+            return loop.time() > until
+        running, crashing = asyncio.ensure_future(shell.run(begin)), asyncio.ensure_future(self._crash.wait())
+        await asyncio.wait({running, crashing}, timeout=until - loop.time(), return_when=asyncio.FIRST_COMPLETED)
+        crashed = crashing.done() and not running.done()
+        for task in (running, crashing):
+            task.cancel()
+        await asyncio.gather(running, crashing, return_exceptions=True)
+        self._drop_journal(mission)
+        if crashed:
+            _vanish(shell)
+        await shell.close()
+        return not crashed
+
+    @staticmethod
+    def _drop_journal(mission: Mission) -> None:
+        """Let the file go as a dead process does: what was not written is lost, and what is written from now on goes nowhere."""
+        store = mission.executor.store
+        assert isinstance(store, JournalStore)
+        nowhere = os.open(store.writer.path.with_name("lost"), os.O_WRONLY | os.O_CREAT, 0o600)
+        os.dup2(nowhere, store.writer._file)
+        os.close(nowhere)
+
+    def _resumed(self, folder: Path) -> tuple[Mission, Callable[[float], None]]:
+        self._resumes += 1
+        found = recorded(str(folder))
+        now = asyncio.get_running_loop().time()
+        return resumed_mission(self._by_proxy(), found.task, found.engine, found.journal, [], now)
 
     def _by_proxy(self) -> Directory:
         nodes = self._directory.nodes
@@ -249,6 +303,13 @@ def _signal(process: int, number: signal.Signals) -> None:
     if process:
         with contextlib.suppress(ProcessLookupError):
             os.kill(process, number)
+
+
+def _vanish(shell: RealtimeMission) -> None:
+    """Abort all connections without a word."""
+    for client in shell.clients.values():
+        if client._link is not None:
+            client._link.cut("the coordinator died")
 
 
 def _link(state: str) -> None:

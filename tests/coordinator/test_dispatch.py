@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from coordinator.dispatch import ESCALATION
 from coordinator.engine import Begin, Hold, Pause, Phase, Resume
 from coordinator.fences import STOP_MARGIN
-from coordinator.journal import JournalWriter
+from coordinator.journal import JournalError, JournalWriter
 from coordinator.recording import JournalStore
 from coordinator.task import Executed, Status
 from services.comm import messages as m
@@ -297,6 +298,19 @@ def test_a_firing_costs_one_sync_if_it_starts_hardware_and_none_otherwise(
     bench.go(0.1 + 0.5 + 0.05)
     assert store.safe and m.ResultAck(WORK) in bench.sent(), "within half a second the node may forget it all the same"
     assert writer.syncs - before <= 3
+
+
+def test_nothing_leaves_when_the_journal_cannot_be_written(tmp_path: Path) -> None:
+    """A full disk: the start is not sent on the strength of a record that is not there."""
+    writer = JournalWriter(tmp_path / "run.journal", {})
+    bench = Bench(store=JournalStore(writer, 0.0))
+    bench.link(0.0)
+    full = os.open("/dev/full", os.O_WRONLY)
+    os.dup2(full, writer._file)
+    os.close(full)
+    with pytest.raises(JournalError, match=r"run\.journal: No space left on device; nothing was sent"):
+        bench.executor.stimulate(0.0, Begin())
+    assert bench.calls() == []
 
 
 def test_a_sync_from_outside_leaves_nothing_due(tmp_path: Path) -> None:
