@@ -62,11 +62,14 @@ class JournalWriter:
         """Whether records were handed to the operating system since the last sync."""
         self.syncs = 0
         if header is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
             try:
+                path.parent.mkdir(parents=True, exist_ok=True)
                 self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC, 0o600)
             except FileExistsError as fault:
                 raise JournalError(f"{path}: exists already; a journal is never overwritten") from fault
+            except OSError as fault:
+                text = f"{path}: {fault.strerror}; give --journal a folder that can be written"
+                raise JournalError(text) from fault
             self._buffer += MAGIC
             self.next_number = 0
             self.append("header", {"format": FORMAT, **header})

@@ -77,6 +77,7 @@ def add_page_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Check the task, run it, print and write the result."""
+    from coordinator.journal import JournalError
     from coordinator.launch import mission_id
     from coordinator.mission import MissionError
     from services.comm.directory import DirectoryError
@@ -99,6 +100,8 @@ def run(options: argparse.Namespace) -> int:
         raise CommandError(2 if fault.bad_input else 1, str(fault)) from fault
     except DirectoryError as fault:
         raise CommandError(2, str(fault)) from fault
+    except JournalError as fault:
+        raise CommandError(1 if options.folder is not None and options.folder.exists() else 2, str(fault)) from fault
     result = {**mission.result(options.mode, time.perf_counter() - begun), **learned}
     give(result, task, timeline, options, options.folder)
     tidy(options)

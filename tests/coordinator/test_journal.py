@@ -116,6 +116,13 @@ def test_never_overwritten(tmp_path: Path) -> None:
         JournalWriter(path, {})
 
 
+def test_a_place_where_no_journal_can_be_is_refused(tmp_path: Path) -> None:
+    """A file stands where the folder should be."""
+    (tmp_path / "runs").write_text("")
+    with pytest.raises(JournalError, match=r"runs/a/run\.journal: Not a directory; give --journal a folder"):
+        JournalWriter(tmp_path / "runs" / "a" / "run.journal", {})
+
+
 KILLED = """
 import sys
 from pathlib import Path

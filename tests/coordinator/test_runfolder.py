@@ -78,6 +78,8 @@ def test_run_keeps_as_many_as_it_is_told_in_lock_step_too(tmp_path: Path, capsys
     runs = tmp_path / "runs"
     assert main(given) == 0
     assert not runs.exists()
+    (tmp_path / "file").write_text("")
+    assert main([*given, "--journal", str(tmp_path / "file")]) == 2
     for _ in range(4):
         assert main([*given, "--journal", str(runs), "--keep", "2"]) == 0
     assert len(list(runs.glob(f"*/{JOURNAL}"))) == len(list(runs.glob(f"*/{RESULT}"))) == 2
