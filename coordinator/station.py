@@ -70,7 +70,7 @@ class Station:
         self._starting = False
         self._going: asyncio.Task[None] | None = None
         self._looking = asyncio.get_running_loop().create_task(self._look())
-        self.feed.replace(mission={"id": "", "state": "idle", "mode": "realtime", "starts": True})
+        self.feed.replace(mission={"id": "", "state": "idle", "mode": "realtime", "starts": True, "file": ""})
 
     async def close(self) -> None:
         """Abort the run that goes on and leave."""
@@ -143,6 +143,7 @@ class Station:
             return refusal("task", str(fault))
         self._forget(text.name)
         self._narrator(task).begin("", "realtime", **self._kept(task))
+        self.feed.emit("mission", mission={"file": text.name})
         return {"ok": True}
 
     async def _start(self, who: str, data: Mapping[str, Any]) -> Answer:
@@ -177,6 +178,8 @@ class Station:
             return faulty
         if name != self._loaded:
             self._forget(name)
+        if data.get("mode", "realtime") != "realtime":
+            return refusal("mode", f"no runs of mode {data['mode']!r} here")
         parameters = given_parameters(task, data.get("parameters") or {})
         return await self._live(task, text.text, parameters)
 
@@ -202,6 +205,7 @@ class Station:
             run.discard()
             return {**refusal("unreachable", str(fault)), "nodes": list(fault.nodes)}
         run.lead(self.feed, self.controls, self.door, self._stops)
+        self.feed.emit("mission", mission={"file": self._loaded})
         self._follow(run)
         return {"ok": True, "run": run.identity}
 

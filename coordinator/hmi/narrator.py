@@ -142,7 +142,7 @@ class Narrator:
                     self.feed.emit("variable", time=time, name=name, value=plain_value(value))
         if seen is None or seen.breakpoints != state.breakpoints:
             self.feed.emit("breakpoints", time=time, breakpoints=[self._key(n) for n in sorted(state.breakpoints)])
-        if state.mode is Mode.RUNNING and self.feed.state["mission"]["state"] == "idle":
+        if state.mode in (Mode.RUNNING, Mode.PAUSED) and self.feed.state["mission"]["state"] == "idle":
             self.feed.emit("mission", time=time, mission={"state": "running"})
         if state.mode is Mode.ABORTING and self.feed.state["mission"]["state"] == "running":
             self.feed.emit("mission", time=time, mission={"state": "stopping", "reason": state.ending})

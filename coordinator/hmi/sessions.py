@@ -90,7 +90,7 @@ class Session:
             async with asyncio.timeout(1.0):
                 if self._pending and not self._pending.stale:
                     await self._send(self._encoded(self._pending.take()))  # how it ended
-                await self._socket.close(code=WSCloseCode.GOING_AWAY)
+                await self._socket.close(code=WSCloseCode.GOING_AWAY, message=b"the coordinator has ended")
 
     def _receive(self, change: dict[str, Any]) -> None:
         self._pending.add(change)

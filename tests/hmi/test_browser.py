@@ -16,6 +16,7 @@ from hypothesis import Phase, given, settings
 
 from coordinator.hmi.changes import apply, empty_state
 from coordinator.hmi.server import Page, start_page
+from coordinator.hmi.sessions import Session
 from coordinator.task import Executed, Status
 from coordinator.taskfile import load
 from tests.bench.hmi import SyntheticMission, ticking
@@ -327,8 +328,15 @@ async def test_script_in_names_and_reasons_is_text(browser: Browser, page: Page,
     assert complaints == []
 
 
-async def test_a_lost_connection_is_plain_to_see(browser: Browser, stage: Stage, tasks: Path, tmp_path: Path) -> None:
-    """When the coordinator goes away the page says so at once, and it catches up by itself when it is back."""
+async def test_a_lost_connection_is_plain_to_see(
+    browser: Browser, stage: Stage, tasks: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """When the coordinator goes away without a word the page says so at once, and it catches up when it is back."""
+
+    async def vanish(session: Session) -> None:
+        """Say no goodbye."""
+
+    monkeypatch.setattr(Session, "leave", vanish)
     async with served(stage, tasks, tmp_path / "runs") as first:
         tab = await opened(browser, first)
         port = int(first.url.rpartition(":")[2].partition("/")[0])

@@ -2,6 +2,8 @@
 
 import { attribute, fill, h, s, seconds, text, words } from "./dom.js";
 
+const GLYPH = 0.62; // widths of a letter and heights of a line, in font sizes
+const LINE = 1.15;
 const COLOUR = { predicted: "predicted", found: "found" };
 
 function shape(d) {
@@ -10,6 +12,25 @@ function shape(d) {
   if (d.kind === "box") return s("rect", { ...common, x: d.x, y: d.y, width: d.width, height: d.height });
   if (d.kind === "path") return s("polyline", { ...common, points: (d.points ?? []).map((p) => p.join(",")).join(" ") });
   return s("path", { ...common, d: `M${d.x - 9} ${d.y}h18M${d.x} ${d.y - 9}v18` });
+}
+
+/** Labels beside what they name, inside the image, and clear of each other: further ones go to another corner, then up or down. */
+export function labels(seen, width, height) {
+  const size = Math.max(10, height / 18);
+  const taken = [];
+  return seen.map((d) => {
+    const [x, y, gap] = [d.x ?? 0, d.y ?? 0, (d.r ?? 0) + 8];
+    const wide = d.label.length * size * GLYPH;
+    const right = x + (d.width ?? 0) + gap;
+    const sides = right + wide < width ? [right, x - gap - wide] : [x - gap - wide, right];
+    const rows = [0, 1, -1, 2, -2, 3, -3, 4, -4].map((n) => y - 8 + n * size * LINE);
+    const inside = (left) => Math.max(2, Math.min(left, width - wide - 2));
+    const spots = rows.flatMap((base) => sides.map((left) => ({ left: inside(left), base: Math.max(size, Math.min(base, height - 4)) })));
+    const free = (spot) => taken.every((t) => spot.left >= t.left + t.wide || t.left >= spot.left + wide || Math.abs(spot.base - t.base) >= size * LINE * 0.98);
+    const spot = spots.find(free) ?? spots[0];
+    taken.push({ ...spot, wide });
+    return s("text", { class: "detection-label", "font-size": size, x: spot.left, y: spot.base }, d.label);
+  });
 }
 
 class Frame {
@@ -30,11 +51,7 @@ class Frame {
     const mime = /^image\/(jpeg|png|webp)$/.test(image.mime) ? image.mime : "image/jpeg";
     attribute(this.image, "href", `data:${mime};base64,${image.data}`);
     const seen = image.detections ?? [];
-    const label = (d) => {
-      const far = (d.x ?? 0) > 0.75 * width; // near the right edge the label stands to the left
-      return s("text", { class: "detection-label", "font-size": Math.max(10, height / 18), "text-anchor": far ? "end" : "start", x: (d.x ?? 0) + (far ? -1 : 1) * ((d.r ?? 0) + 8), y: (d.y ?? 0) - 8 }, d.label);
-    };
-    fill(this.over, seen.map(shape), seen.filter((d) => d.label).map(label));
+    fill(this.over, seen.map(shape), labels(seen.filter((d) => d.label), width, height));
     text(this.note, [image.age !== undefined ? `${Math.round(image.age * 1000)} ms old` : "", image.note].filter(Boolean).join(" · "));
   }
 }

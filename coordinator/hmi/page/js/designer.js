@@ -87,9 +87,11 @@ export class Designer {
   }
 
   async refreshTasks() {
-    const names = (await listTasks()).map((t) => t.name);
+    const tasks = await listTasks();
+    const names = tasks.map((t) => t.name);
+    const whose = new Map(tasks.map((t) => [t.name, t.own === false ? " (shipped)" : t.shipped ? " (my copy)" : ""]));
     const own = this.model.name && !names.includes(this.model.name) ? [this.model.name] : [];
-    fill(this.picker, this.model.name ? null : h("option", { value: "" }, "(new task)"), [...own, ...names].map((n) => h("option", { value: n }, words(n))));
+    fill(this.picker, this.model.name ? null : h("option", { value: "" }, "(new task)"), [...own, ...names].map((n) => h("option", { value: n }, `${words(n)}${whose.get(n) ?? ""}`)));
     this.picker.value = this.model.name;
   }
 
@@ -101,6 +103,7 @@ export class Designer {
     this.selection = { names: new Set(), arc: null };
     this.findings = task.findings;
     this.text = task.text;
+    this.isShipped = task.own === false;
     this.model.load(task);
     await this.refreshTasks();
     this.view.fit();
@@ -119,6 +122,7 @@ export class Designer {
     if (this.model.dirty && !(await this.sure("Leave without saving?"))) return;
     this.documents += 1;
     this.selection = { names: new Set(), arc: null };
+    this.isShipped = false;
     this.model.load({ name: "", revision: null, document: emptyDocument("new_task") });
     this.refreshTasks();
     this.view.look(0, 0, 1);
@@ -145,6 +149,7 @@ export class Designer {
     const documents = this.documents;
     const saved = await saveTask(this.model, name);
     if (!saved || documents !== this.documents) return false;
+    this.isShipped = saved.own === false;
     if (saved.reload) this.model.load(saved);
     else this.model.savedAs(saved, sent);
     this.findings = saved.findings;
@@ -180,6 +185,7 @@ export class Designer {
     const made = await importNet(form, await file.text());
     if (!made) return;
     this.documents += 1;
+    this.isShipped = false;
     this.model.load({ name: "", revision: null, document: made.document });
     await this.refreshTasks();
     this.view.fit();
@@ -201,7 +207,7 @@ export class Designer {
 
   paintState() {
     const { model } = this;
-    text(this.state, model.dirty ? "not saved" : model.name ? "saved" : "");
+    text(this.state, model.dirty ? "not saved" : !model.name ? "" : this.isShipped ? "shipped, saving makes your copy" : "saved");
     attribute(this.state, "data-dirty", model.dirty ? "" : null);
     this.undoButton.disabled = !model.past.length;
     this.redoButton.disabled = !model.future.length;

@@ -5,6 +5,7 @@ import { apply, emptyState, PART } from "./state.js";
 const LOST_AFTER_MS = 3500;
 const RETRY_MS = [250, 500, 1000, 2000, 4000];
 const ANSWER_MS = 20000;
+const GOING_AWAY = 1001;
 
 /** A tab's secret: it stays the same operator after a refresh. */
 function tabSecret() {
@@ -21,6 +22,7 @@ export class Link {
   constructor(painted) {
     this.state = emptyState();
     this.connected = false;
+    this.goodbye = false; // the server said that it ends, so nothing was lost
     this.gaps = 0;
     this.deltas = 0;
     this.lastPaint = 0;
@@ -48,7 +50,10 @@ export class Link {
       socket.send(JSON.stringify({ type: "hello", protocol: 1, name, tab: tabSecret() }));
     };
     socket.onmessage = (event) => this.hear(JSON.parse(event.data));
-    socket.onclose = () => this.lost(socket);
+    socket.onclose = (event) => {
+      if (socket === this.socket && event.code === GOING_AWAY && event.reason) this.goodbye = true;
+      this.lost(socket);
+    };
   }
 
   lost(socket) {
@@ -122,6 +127,7 @@ export class Link {
     this.changed.add("all");
     this.tries = 0;
     this.connected = true;
+    this.goodbye = false;
     document.documentElement.dataset.sequence = String(this.state.sequence);
   }
 

@@ -56,6 +56,7 @@ export class Live {
   draw() {
     const { task } = this.link.state;
     this.notice.hidden = Boolean(task);
+    text(this.notice, this.link.state.mission.file === undefined ? "No task is loaded." : "Choose a task above, or draw one under Design.");
     if (!task) return;
     if (this.inside && !task.places.some((p) => p.name === this.inside)) this.inside = "";
     this.canvas.show(sheetOf(task, this.inside));

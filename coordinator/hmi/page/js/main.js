@@ -11,6 +11,8 @@ import { Banner, Operator } from "./operator.js";
 import { toast } from "./toast.js";
 
 const TICK_MS = 100;
+const LOST = "Connection to the coordinator lost. What you see is old. Trying again …";
+const ENDED = "This coordinator has ended in good order; its nodes and emergency stop are no longer reached from here. What you see is how it ended.";
 
 class App {
   constructor(root) {
@@ -18,7 +20,7 @@ class App {
     this.operator = new Operator(this.link);
     this.banner = new Banner();
     this.tabs = { Live: new Live(this.link, this.operator), Design: new Designer(this.link, this.operator), History: new History(this.link, this.operator) };
-    this.lostNote = h("div", { class: "lost", role: "alert", hidden: true }, icon("link"), h("span", {}, "Connection to the coordinator lost. What you see is old. Trying again …"));
+    this.lostNote = h("div", { class: "lost", role: "alert", hidden: true }, icon("link"), h("span", {}, LOST));
     this.switch = h("nav", { class: "switch", role: "tablist", "aria-label": "Views" }, Object.keys(this.tabs).map((name) => h("button", { type: "button", role: "tab", onclick: () => this.show(name) }, name)));
     this.theme = h("button", { type: "button", class: "tool", onclick: () => this.setTheme(this.dark ? "light" : "dark") });
     this.wall = h("button", { type: "button", class: "tool", "aria-label": "Wall screen: larger type", title: "Wall screen: larger type", "aria-pressed": "false", onclick: () => this.setWall(!this.isWall) }, icon("wall"));
@@ -70,7 +72,9 @@ class App {
     const { state, connected } = this.link;
     this.lostNote.hidden = connected || !this.everConnected;
     this.everConnected ||= connected;
-    attribute(document.documentElement, "data-connected", connected ? "yes" : "no");
+    text(this.lostNote.lastChild, this.link.goodbye ? ENDED : LOST);
+    attribute(this.lostNote, "data-ended", this.link.goodbye ? "" : null);
+    attribute(document.documentElement, "data-connected", connected ? "yes" : this.link.goodbye ? "ended" : "no");
     this.banner.update(state, this.link.now());
     this.operator.update(state);
     this.tabs.Live.paint(changed, changes);

@@ -1,6 +1,7 @@
 // The operator's controls: mission commands, who holds the controls, and the emergency stop that is always there.
 
 import { attribute, fill, h, seconds, text, words } from "./dom.js";
+import { listTasks } from "./files.js";
 import { icon } from "./icons.js";
 import { toast } from "./toast.js";
 
@@ -10,7 +11,7 @@ const DONE = {
   start: "Started", pause: "Paused", resume: "Goes on", step: "One firing", abort: "Aborted", estop: "Emergency stop given",
   add_tokens: "Token added", remove_tokens: "Token removed", raise_event: "Event raised", force_exit: "Exit forced",
   take_controls: "You hold the controls", ask_controls: "Asked for the controls", release_controls: "Controls released",
-  override_selector: "Selector set", breakpoint: "Breakpoint set",
+  load: "Task loaded", clear_estop: "Emergency stop cleared", override_selector: "Selector set", breakpoint: "Breakpoint set",
 };
 const STATE_WORD = {
   idle: "Ready", preparing: "Preparing", running: "Running", stopping: "Stopping", paused: "Paused", success: "Success",
@@ -37,9 +38,11 @@ export class Operator {
       resume: button("resume", "resume", "Resume"),
       abort: button("abort", "abort", "Abort", { class: "command danger", onclick: () => this.confirm(this.buttons.abort, "abort", "Abort the mission?") }),
     };
+    this.clear = button("clear_estop", "check", "Clear the stop", { hidden: true });
+    this.picker = h("select", { class: "pick-task", "aria-label": "Task to start", onchange: () => this.load(), onfocus: () => this.listTasks() });
     this.controls = h("div", { class: "holder" });
     this.answer = h("p", { class: "pause-note", role: "status" });
-    this.bar = h("div", { class: "operator", role: "toolbar", "aria-label": "Mission" }, Object.values(this.buttons), this.answer, this.controls);
+    this.bar = h("div", { class: "operator", role: "toolbar", "aria-label": "Mission" }, this.picker, Object.values(this.buttons), this.clear, this.answer, this.controls);
     this.estop = h("button", { type: "button", class: "estop", "aria-keyshortcuts": ESTOP_KEY, onclick: () => this.stopNow() },
       icon("stop"), h("span", {}, "Emergency stop"), h("kbd", {}, ESTOP_KEY));
     addEventListener("keydown", (event) => {
@@ -92,11 +95,43 @@ export class Operator {
     const live = ["running", "paused", "stopping"].includes(now);
     const set = { start: may && !live && now !== "preparing", pause: may && now === "running", step: may && now === "paused", resume: may && now === "paused", abort: may && (live || now === "preparing") };
     for (const [verb, on] of Object.entries(set)) this.buttons[verb].disabled = !on;
+    this.showTasks(state, may && !live && now !== "preparing");
+    this.buttons.start.hidden = state.mission.starts === false;
+    this.buttons.start.disabled ||= !state.task;
+    this.clear.hidden = now !== "stopped";
+    this.clear.disabled = !may;
     const why = may ? "" : "Take the controls first";
     for (const button of Object.values(this.buttons)) attribute(button, "title", button.disabled && why ? why : null);
     this.estop.disabled = false;
     this.showPause(state);
     this.showHolder(state);
+  }
+
+  /** The tasks that can be started, where this coordinator stays for more than one run. */
+  showTasks(state, may) {
+    const { mission } = state;
+    this.picker.hidden = mission.file === undefined;
+    this.picker.disabled = !may;
+    attribute(this.picker, "title", this.link.mayAct ? null : "Take the controls first");
+    const key = `${mission.file}`;
+    if (this.picker.hidden || this.tasksKey === key) return;
+    this.tasksKey = key;
+    this.listTasks();
+  }
+
+  async listTasks() {
+    const tasks = await listTasks();
+    const { file } = this.link.state.mission;
+    const known = tasks.map((t) => [t.name, t.own === false ? `${words(t.name)} (shipped)` : words(t.name)]);
+    if (file && !tasks.some((t) => t.name === file)) known.unshift([file, words(file)]);
+    fill(this.picker, h("option", { value: "" }, "Choose a task"), known.map(([value, label]) => h("option", { value }, label)));
+    this.picker.value = file ?? "";
+  }
+
+  async load() {
+    const task = this.picker.value;
+    const answer = task ? await this.give("load", { task }, true) : { ok: false };
+    if (!answer.ok) this.picker.value = this.link.state.mission.file ?? "";
   }
 
   showPause(state) {
