@@ -42,6 +42,7 @@ bench: $(VENV)/.ready
 	$(BIN)/python tests/bench/doors.py
 	$(BIN)/python tests/bench/journal.py
 	$(BIN)/python -m tests.bench.analysis
+	$(BIN)/python -m tests.bench.learning
 
 clean:
 	rm -rf $(VENV) build *.egg-info reports runs .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from typing import Any
 
-from tests.proof import catching, long_tests
+from tests.proof import catching, convergence, learning, long_tests
 from tests.proof.page import figures
 from tests.proof.proof import KEPT, ROOT, Proof
 
@@ -24,7 +24,7 @@ FIGURES = ROOT / "docs" / "figures.md"
 
 def proofs() -> list[Proof]:
     """All of them, in the order in which people wait for them."""
-    return [*catching.proofs(), *long_tests.proofs()]
+    return [*catching.proofs(), *convergence.proofs(), *long_tests.proofs(), *learning.proofs()]
 
 
 def kept(proof: Proof) -> dict[str, Any] | None:
