@@ -8,7 +8,7 @@ transitions that wait for events or timers race with their measured waits; every
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,27 +19,32 @@ from coordinator.net import Marking
 
 IDLE, GOING, DONE = 0, 1, 2
 LONGEST = 10_000
-"""Steps after which a throw counts as one that never ends."""
+"""Firings without time going on, and steps of a throw, after which it counts as one that never ends."""
 Choices = Mapping[str, Mapping[str, float]]
 """By primitive task: the probability of each action."""
 
 
 @dataclass(frozen=True)
 class Played:
-    """What throws came to. Arrays (columns,)."""
+    """What throws came to. Arrays (columns,); a throw that never ended has not completed."""
 
     goals: Codes
     completed: Mask
     all_success: Mask
     time: Values
     """s from the taking of the run token to the end; nan for those that did not complete."""
+    endless: int = 0
+    """Throws that were cut off after `longest` steps."""
 
 
 class Play:
     """Throws under way; `replicate` (columns,) says whose bootstrap weights each one draws with."""
 
-    def __init__(self, structure: Structure, drawer: Drawer, choices: Choices, replicate: Codes) -> None:
-        """Raises ValueError for a choice without probabilities."""
+    def __init__(
+        self, structure: Structure, drawer: Drawer, choices: Choices, replicate: Codes, longest: int = LONGEST
+    ) -> None:
+        """`longest`: steps (ends of runs and of waits) of a throw at most. Raises ValueError for a choice without probabilities."""
+        self._longest = longest
         self._s, self._drawer = structure, drawer
         n, q = len(replicate), len(structure.vocabulary.places)
         self._choices = [self._choice(choices, name) for name in structure.vocabulary.places]
@@ -76,14 +81,14 @@ class Play:
         for q, place in enumerate(self._s.action_places):
             if self._s.initial[place]:
                 self._start(q, np.arange(len(self._column)))
-        for _ in range(LONGEST):
+        for _ in range(self._longest):
             self._settle()
             self._finish(self._over())
             if not len(self._column):
-                return self._out
+                break
             self._wait()
             self._advance()
-        return self._out
+        return replace(self._out, endless=len(self._column))
 
     # --- one step ----------------------------------------------------------------------------------------------------
 

@@ -97,6 +97,7 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
         "residual": residuals(training, structure, laws, request, random),
         "routing": routing(training),
         "not_back": sum(t.completed and t.time is None for t in training.throws),
+        "endless": round(whole.endless / request.point, 6),
         "assumptions": list(structure.assumptions),
     }
 
@@ -122,12 +123,17 @@ def _played(
 ) -> Played:
     drawer = Drawer(laws, training.waits, weights, random)
     try:
-        return Play(structure, drawer, request.choices, replicate).run()
+        return Play(structure, drawer, request.choices, replicate, longest_of(training)).run()
     except KeyError as fault:
         place, action = fault.args[0]
         names = training.vocabulary
         text = f"{names.places[place]}: no run of {names.actions[action - 1]} was measured"
         raise ValueError(text) from fault
+
+
+def longest_of(training: Training) -> int:
+    """Steps after which a played throw counts as endless: twenty times as many as the longest measured one had, and a hundred."""
+    return 100 + 20 * max(len(throw.runs) + len(throw.waits) for throw in training.throws)
 
 
 def _bootstrap(

@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from coordinator.analysis.completion import law
 from coordinator.analysis.forecast import forecast as solve
 from coordinator.analysis.space import Limits
 from coordinator.analysis.stochastic import NoEstimate, stochastic_view
@@ -27,8 +28,10 @@ METHOD = (
     "training throws, with the noise of the new runs. Beside it the exact solution of the stochastic view (GSPN): phase-type "
     "durations, statuses of one throw independent of each other."
 )
-LARGEST = 200_000
+LARGEST = 50_000
 """Markings up to which the stochastic view is solved."""
+JUMPS = 20_000
+"""Jumps of the uniformised chain up to which its quantile is worked out."""
 
 
 class ForecastError(Exception):
@@ -111,9 +114,12 @@ def exact(task: Task, estimates: Estimates, regime: str, choice: Choice) -> dict
         if task.runs_place:
             view = replace(view, gspn=view.gspn.marked({task.runs_place: 1}))
         found = solve(view, limits=Limits(states=LARGEST))
-        q90 = found.law().quantile(0.9) if found.completion_probability > 0 else None
     except (NoEstimate, ValueError, ArithmeticError) as fault:
         return {"why": str(fault)}
+    try:
+        q90 = law(found.chain, found.done.goal, steps=JUMPS).quantile(0.9) if found.completion_probability > 0 else None
+    except ArithmeticError:
+        q90 = None
     numbers = {
         "R_goal": found.goal_reliability,
         "P_complete": found.completion_probability,

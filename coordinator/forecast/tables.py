@@ -32,6 +32,11 @@ def forecast_text(made: Mapping[str, Any]) -> str:
                     f"    {found['places'][0]} and {found['places'][1]} depend on each other: p = {found['p']:.1e}"
                 )
         lines.append(f"    {said['contexts']} contexts; {_worst(said['residual'])}")
+        if said["endless"] > 0.0005:
+            lines.append(
+                f"    note: {said['endless']:.1%} of the throws played never end: branches that watch each other need more "
+                "training throws, so that the contexts can tell them apart"
+            )
         lines += [f"    note: {note}" for note in said["assumptions"]]
     return "\n".join(lines)
 
