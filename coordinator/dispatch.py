@@ -251,6 +251,11 @@ class Dispatch:
         for flight in [f for f in self.flights.values() if f.waits and f.device == device]:
             self._call(now, flight)
 
+    @property
+    def idle(self) -> bool:
+        """Whether time alone can change nothing: no timer, no fence (and so no run that waits for one)."""
+        return not self._timers and not self._fences
+
     def due(self) -> float | None:
         """When `advance` has something to do next."""
         times = [self._timers.due(), self._fences.due()]

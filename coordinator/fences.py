@@ -31,6 +31,9 @@ class Fences:
     def __contains__(self, device: str) -> bool:
         return device in self._fences
 
+    def __len__(self) -> int:
+        return len(self._fences)
+
     def __getitem__(self, device: str) -> Fence:
         return self._fences[device]
 

@@ -21,6 +21,9 @@ class Timers:
     def __contains__(self, key: str) -> bool:
         return key in self._timers
 
+    def __len__(self) -> int:
+        return len(self._timers)
+
     def arm(self, now: float, key: str, seconds: float) -> None:
         """Be over in so many seconds."""
         self._timers[key] = _Timer(now + seconds)
