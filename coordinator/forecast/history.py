@@ -49,6 +49,35 @@ class Vocabulary:
 
 
 @dataclass(frozen=True)
+class Seen:
+    """What had ended before in the same throw. Arrays (q places, n columns)."""
+
+    outcome: Codes
+    """Of the latest run in each place; NONE without any."""
+    action: Codes
+    took: Values
+    """s; nan without any."""
+    visits: Codes
+    """How many runs had ended there."""
+
+    @classmethod
+    def nothing(cls, q: int, n: int) -> Seen:
+        """Nothing has ended yet."""
+        return cls(
+            np.zeros((q, n), np.int64), np.zeros((q, n), np.int64), np.full((q, n), np.nan), np.zeros((q, n), np.int64)
+        )
+
+    def of(self, which: NDArray[np.bool_] | Codes) -> Seen:
+        """Some columns."""
+        return Seen(self.outcome[:, which], self.action[:, which], self.took[:, which], self.visits[:, which])
+
+    def note(self, q: int, columns: Codes, outcome: Codes, action: Codes, took: Values) -> None:
+        """Runs have ended in a place."""
+        self.outcome[q, columns], self.action[q, columns], self.took[q, columns] = outcome, action, took
+        self.visits[q, columns] += 1
+
+
+@dataclass(frozen=True)
 class Runs:
     """All runs of some throws. `n` runs, `q` action places."""
 
@@ -65,11 +94,7 @@ class Runs:
     throw: Codes
     """Index of its throw."""
     weight: Values
-    seen_outcome: Codes
-    """(q, n): outcome of the latest run that had ended in each place of its throw when it began; NONE without any."""
-    seen_action: Codes
-    seen_took: Values
-    """nan without any."""
+    seen: Seen
 
     def of(self, which: NDArray[np.bool_] | Codes) -> Runs:
         """Some of them."""
@@ -82,9 +107,7 @@ class Runs:
             self.took[which],
             self.throw[which],
             self.weight[which],
-            self.seen_outcome[:, which],
-            self.seen_action[:, which],
-            self.seen_took[:, which],
+            self.seen.of(which),
         )
 
     def __len__(self) -> int:
@@ -136,8 +159,7 @@ def _runs(vocabulary: Vocabulary, throws: tuple[Throw, ...]) -> Runs:
     flat = [(i, run) for i, throw in enumerate(throws) for run in throw.runs if run.place in places]
     codes = [_outcome(vocabulary, run) for _, run in flat]
     n, q = len(flat), len(places)
-    seen_outcome, seen_action = np.zeros((q, n), np.int64), np.zeros((q, n), np.int64)
-    seen_took = np.full((q, n), np.nan)
+    seen = Seen.nothing(q, n)
     begin = 0
     while begin < n:
         end = begin
@@ -145,9 +167,9 @@ def _runs(vocabulary: Vocabulary, throws: tuple[Throw, ...]) -> Runs:
             end += 1
         for j in range(begin, end):
             for i in _ended_before(flat, j, begin, end):
-                p = places[flat[i][1].place]
-                seen_outcome[p, j], seen_action[p, j] = codes[i], actions.get(flat[i][1].action, 0)
-                seen_took[p, j] = flat[i][1].took
+                run = flat[i][1]
+                one = (np.array([codes[i]]), np.array([actions.get(run.action, 0)]), np.array([run.took]))
+                seen.note(places[run.place], np.array([j]), *one)
         begin = end
     return Runs(
         np.array([places[run.place] for _, run in flat], np.int64),
@@ -158,9 +180,7 @@ def _runs(vocabulary: Vocabulary, throws: tuple[Throw, ...]) -> Runs:
         np.array([run.took for _, run in flat]),
         np.array([i for i, _ in flat], np.int64),
         np.ones(n),
-        seen_outcome,
-        seen_action,
-        seen_took,
+        seen,
     )
 
 

@@ -2,10 +2,10 @@
 
 Contexts are grown as in CHAID (G. V. Kass, Applied Statistics 29 (1980) 119-127): the factor on which the response depends most
 significantly splits the runs, again and again, until no test rejects independence. Factors are what had ended before in the same
-throw: in each action place the outcome, the action and the duration of the latest run. First the outcome is unfolded so, then,
-for each outcome of each of these contexts, the duration: so a strong dependence among durations never hides one among outcomes.
-Within a context a duration keeps its linear trend with an earlier one.
-Censored runs pass their weight on to later ends (B. Efron's redistribution to the right, 1967): the Aalen-Johansen estimate.
+throw: in each action place outcome, action and duration of the latest run, and the number of runs. First the outcome is unfolded
+so, then, for each outcome of each of these contexts, the duration: so a strong dependence among durations never hides one among
+outcomes. Within a context a duration keeps its linear trend with an earlier one. Censored runs pass their weight on to later ends
+(B. Efron's redistribution to the right, 1967): the Aalen-Johansen estimate.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2_contingency
 
-from coordinator.forecast.history import CENSORED, Codes, Runs, Training, Values, Vocabulary
+from coordinator.forecast.history import CENSORED, Codes, Runs, Seen, Training, Values, Vocabulary
 
 ALPHA = 0.01
 """Level at which dependence counts, over all factors of a node (Bonferroni)."""
@@ -57,27 +57,32 @@ class Split:
     """What tells the contexts below a node apart."""
 
     kind: str
-    """outcome, action or took."""
+    """outcome, action, visits or took."""
     place: int
     edges: tuple[float, ...] = ()
     """took: where its classes end (s)."""
     missing: bool = False
     """took: the first child is for throws in which no such run had ended."""
     groups: Mapping[int, int] = field(default_factory=dict)
-    """outcome, action: child of each code; any other code has the last child."""
+    """outcome, action, visits: child of each code; any other code has the last child."""
     p_value: float = 1.0
 
-    def child(self, outcome: Codes, action: Codes, took: Values, count: int) -> Codes:
-        """Child of each column, from what was seen in all places (arrays (q, n))."""
+    def child(self, seen: Seen, count: int) -> Codes:
+        """Child of each column, from what was seen in all places."""
         if self.kind == "took":
-            seconds = took[self.place]
+            seconds = seen.took[self.place]
             group = np.searchsorted(np.array(self.edges), np.nan_to_num(seconds), side="right")
             return np.where(np.isnan(seconds), 0, group + self.missing)
-        codes = (outcome if self.kind == "outcome" else action)[self.place]
+        codes = codes_of(seen, self.kind)[self.place]
         out = np.full(len(codes), count - 1)
         for code, group in self.groups.items():
             out[codes == code] = group
         return out
+
+
+def codes_of(seen: Seen, kind: str) -> Codes:
+    """Codes (q, n) of a factor."""
+    return {"outcome": seen.outcome, "action": seen.action, "visits": seen.visits}[kind]
 
 
 @dataclass
@@ -175,7 +180,7 @@ def _trend(runs: Runs) -> Trend | None:
     """The strongest linear dependence on an earlier duration, if it is beyond three standard errors."""
     best: Trend | None = None
     strongest, n = SURE, len(runs)
-    for place, earlier in enumerate(runs.seen_took):
+    for place, earlier in enumerate(runs.seen.took):
         if n < LEAST // 2 or np.isnan(earlier).any() or earlier.std() == 0 or runs.took.std() == 0:
             continue
         slope = float(np.cov(earlier, runs.took)[0, 1] / earlier.var(ddof=1))
@@ -191,8 +196,8 @@ def best_split(runs: Runs, *, outcomes: bool) -> tuple[Split, Codes] | None:
     response = runs.outcome if outcomes else _classes(runs.took)
     groups = GROUPS // 2 if outcomes else GROUPS
     candidates: list[tuple[float, Split, Codes]] = []
-    for place in range(len(runs.seen_outcome)):
-        for kind in ("outcome", "action", "took"):
+    for place in range(len(runs.seen.outcome)):
+        for kind in ("outcome", "action", "visits", "took"):
             made = _by_duration(runs, place, groups) if kind == "took" else _candidate(runs, kind, place)
             if made is not None:
                 candidates.append((_p_value(made[1], response), *made))
@@ -209,7 +214,7 @@ def _classes(took: Values) -> Codes:
 
 
 def _candidate(runs: Runs, kind: str, place: int) -> tuple[Split, Codes] | None:
-    codes = (runs.seen_outcome if kind == "outcome" else runs.seen_action)[place]
+    codes = codes_of(runs.seen, kind)[place]
     found, counts = np.unique(codes, return_counts=True)
     large = [int(c) for c, n in zip(found, counts, strict=True) if n >= LEAST]
     if len(found) - len(large) and len(codes) - counts[counts >= LEAST].sum() < LEAST and large:
@@ -219,11 +224,11 @@ def _candidate(runs: Runs, kind: str, place: int) -> tuple[Split, Codes] | None:
     if len(groups) + rest < 2:
         return None
     split = Split(kind, place, groups=groups)
-    return split, split.child(runs.seen_outcome, runs.seen_action, runs.seen_took, len(groups) + rest)
+    return split, split.child(runs.seen, len(groups) + rest)
 
 
 def _by_duration(runs: Runs, place: int, most: int) -> tuple[Split, Codes] | None:
-    seconds = runs.seen_took[place]
+    seconds = runs.seen.took[place]
     known = ~np.isnan(seconds)
     if known.sum() < 2 * LEAST or 0 < (~known).sum() < LEAST:
         return None
@@ -231,7 +236,7 @@ def _by_duration(runs: Runs, place: int, most: int) -> tuple[Split, Codes] | Non
     edges = np.unique(np.quantile(seconds[known], np.arange(1, groups) / groups))
     missing = not bool(known.all())
     split = Split("took", place, tuple(float(e) for e in edges), missing)
-    child = split.child(runs.seen_outcome, runs.seen_action, runs.seen_took, 0)
+    child = split.child(runs.seen, 0)
     counts = np.bincount(child, minlength=len(edges) + 1 + missing)
     return (split, child) if len(counts) > 1 and counts.min() >= LEAST // 2 else None
 

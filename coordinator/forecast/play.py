@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from coordinator.forecast.history import Codes, Values
+from coordinator.forecast.history import Codes, Seen, Values
 from coordinator.forecast.sampling import Drawer, Mask
 from coordinator.forecast.structure import ERROR, SUCCESS, Move, Structure
 from coordinator.net import Marking
@@ -62,8 +62,7 @@ class Play:
             np.zeros((q, n), np.int64),
             np.zeros((q, n)),
         )
-        self._seen_outcome, self._seen_action = np.zeros((q, n), np.int64), np.zeros((q, n), np.int64)
-        self._seen_took = np.full((q, n), np.nan)
+        self._seen = Seen.nothing(q, n)
         self._now, self._begun = np.zeros(n), np.zeros(n)
         self._goals, self._good = np.zeros(n, np.int64), np.ones(n, np.bool_)
         self._ends: dict[Marking, int] = {}
@@ -153,8 +152,7 @@ class Play:
             raise ValueError(f"{self._s.vocabulary.places[q]}: no action has a probability above 0")
         which = np.searchsorted(bounds, self._drawer.chance(len(columns)), side="right")
         action = codes[np.minimum(which, len(codes) - 1)]
-        seen = (self._seen_outcome[:, columns], self._seen_action[:, columns], self._seen_took[:, columns])
-        ends = self._drawer.ends(q, action, self._replicate[columns], *seen)
+        ends = self._drawer.ends(q, action, self._replicate[columns], self._seen.of(columns))
         status, taken = self._s.vocabulary.parts(ends.outcome)
         self._phase[q, columns], self._status[q, columns], self._want[q, columns] = GOING, status, taken
         self._preempted[q, columns], self._end[q, columns] = ends.preempted, self._now[columns] + ends.took
@@ -201,9 +199,7 @@ class Play:
         if not len(columns):
             return
         self._end[q, columns] = np.inf
-        self._seen_outcome[q, columns] = self._outcome[q, columns]
-        self._seen_action[q, columns] = self._action[q, columns]
-        self._seen_took[q, columns] = self._took[q, columns]
+        self._seen.note(q, columns, self._outcome[q, columns], self._action[q, columns], self._took[q, columns])
         self._good[columns] &= self._status[q, columns] <= SUCCESS  # censored ones spoil nothing
         cut = columns[self._preempted[q, columns]]
         self._phase[q, columns] = DONE
@@ -257,10 +253,10 @@ class Play:
         self._out.all_success[own] = self._good[over] & done
         self._out.time[own] = np.where(done, self._now[over] - self._begun[over], np.nan)
         kept = ~over
+        self._seen = self._seen.of(kept)
         for name in ("_column", "_replicate", "_now", "_begun", "_goals", "_good"):
             setattr(self, name, getattr(self, name)[kept])
         for name in (
             "_tokens", "_phase", "_status", "_want", "_preempted", "_end", "_due", "_action", "_outcome", "_took",
-            "_seen_outcome", "_seen_action", "_seen_took",
         ):  # fmt: skip
             setattr(self, name, getattr(self, name)[:, kept])

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.forecast.history import Codes, Values
+from coordinator.forecast.history import Codes, Seen, Values
 from coordinator.forecast.laws import Context, Law, Laws
 
 Mask = NDArray[np.bool_]
@@ -32,8 +32,8 @@ class Drawer:
         self._laws, self._waits, self._weights, self._random = laws, waits, weights, random
         self._bounds: dict[object, Values] = {}
 
-    def ends(self, place: int, action: Codes, replicate: Codes, outcomes: Codes, actions: Codes, took: Values) -> Ends:
-        """Ends of runs that begin now in a place. `outcomes`, `actions`, `took` (places, columns) is what had ended before.
+    def ends(self, place: int, action: Codes, replicate: Codes, seen: Seen) -> Ends:
+        """Ends of runs that begin now in a place, given what had ended before.
 
         Raises KeyError for an action that was never run there.
         """
@@ -41,37 +41,32 @@ class Drawer:
         out = Ends(np.zeros(n, np.int64), np.zeros(n, np.bool_), np.zeros(n))
         for code in np.unique(action):
             top = self._laws.contexts[place, int(code)]
-            self._descend(top, np.flatnonzero(action == code), replicate, outcomes, actions, took, out)
+            self._descend(top, np.flatnonzero(action == code), replicate, seen, out)
         return out
 
-    def _descend(
-        self, node: Context, columns: Codes, replicate: Codes, outcomes: Codes, actions: Codes, took: Values, out: Ends
-    ) -> None:
+    def _descend(self, node: Context, columns: Codes, replicate: Codes, seen: Seen, out: Ends) -> None:
         if node.split is None:
-            self._draw_leaf(node, columns, replicate, outcomes, actions, took, out)
+            self._draw_leaf(node, columns, replicate, seen, out)
             return
-        seen = (outcomes[:, columns], actions[:, columns], took[:, columns])
-        child = node.split.child(*seen, len(node.children))
+        child = node.split.child(seen.of(columns), len(node.children))
         for c, below in enumerate(node.children):
             own = columns[child == c]
             if len(own):
-                self._descend(below, own, replicate, outcomes, actions, took, out)
+                self._descend(below, own, replicate, seen, out)
 
-    def _draw_leaf(
-        self, leaf: Context, columns: Codes, replicate: Codes, outcomes: Codes, actions: Codes, took: Values, out: Ends
-    ) -> None:
+    def _draw_leaf(self, leaf: Context, columns: Codes, replicate: Codes, seen: Seen, out: Ends) -> None:
         """First the outcome, then the duration from the outcome's own tree."""
         law = leaf.law
         index = self._draw(leaf.number, law.weight, law.throw, replicate[columns])
         if not leaf.durations:
-            out.took[columns] = law.took[index] + _along(law, index, took[:, columns])
+            out.took[columns] = law.took[index] + _along(law, index, seen.took[:, columns])
             np.clip(out.took, 0.0, None, out=out.took)
             return
         out.outcome[columns], out.preempted[columns] = law.outcome[index], law.preempted[index]
         for code, tree in leaf.durations.items():
             own = columns[law.outcome[index] == code]
             if len(own):
-                self._descend(tree, own, replicate, outcomes, actions, took, out)
+                self._descend(tree, own, replicate, seen, out)
 
     def wait(self, transition: str, replicate: Codes) -> Values | None:
         """Waits of a transition (s), one for each column; None if it was never measured."""

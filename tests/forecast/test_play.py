@@ -121,9 +121,7 @@ out = ["end"]
     assert (played.all_success == (played.time == 2.0)).all()
 
 
-def test_a_loop_is_geometric() -> None:
-    """Tried again with probability 1/2 each time: mean number of runs 2."""
-    text = """
+LOOP = """
 [transitions.begin]
 in = ["jobs"]
 out = ["a"]
@@ -140,13 +138,27 @@ out = ["end"]
 in = ["b:error"]
 out = ["end"]
 """
+
+
+def test_a_loop_is_geometric() -> None:
+    """Tried again with probability 1/2 each time: mean number of runs 2."""
     throws = [
         Throw(1, 0.0, runs=[entry("a", 1.0, taken="done")]),
         Throw(1, 0.0, runs=[entry("a", 1.0, "error", "again")]),
     ]
-    played = play(text, throws, 5000)
+    played = play(LOOP, throws, 5000)
     assert played.time.mean() == pytest.approx(2.0, abs=0.08)
     assert np.mean(played.time == 1.0) == pytest.approx(0.5, abs=0.03)
+
+
+def test_a_loop_that_is_counted_is_no_geometric_one() -> None:
+    """Always interrupted twice, then done: the number of runs before is a context of its own."""
+    runs = [
+        RunEntry("a", "run_a", float(k), 1.0, "error" if k < 2 else "success", taken="again" if k < 2 else "done")
+        for k in range(3)
+    ]
+    played = play(LOOP, [Throw(1, 0.0, runs=runs)] * 60)
+    assert set(played.time.tolist()) == {3.0}
 
 
 def test_timers_and_events_race() -> None:
