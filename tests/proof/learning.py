@@ -42,9 +42,7 @@ def learn(sizes: Sizes, options: argparse.Namespace) -> Result:
         learned[seed] = {name: known["best"] for name, known in found["policy"][regime].items()}
     best = best_fixed(sizes, task, regime)
     default = {p.name: p.alternatives[0] for p in task.primitive_tasks.values() if len(p.alternatives) > 1}
-    judge(sizes, "default", default, regime)
-    judge(sizes, "best", best, regime)
-    lines = [_judged(sizes, seed, actions, best, regime) for seed, actions in learned.items()]
+    lines = [_judged(sizes, seed, actions, best, default, regime) for seed, actions in learned.items()]
     holds = all(
         line["J beyond the best, upper 95 %"] <= CLOSE and line["J beyond the default, upper 95 %"] < 0
         for line in lines
@@ -87,11 +85,24 @@ def judge(
     return campaign(sizes, name, throws or sizes.of(5000), seed, regime, "--choose", text)
 
 
-def _judged(sizes: Sizes, seed: int, actions: Mapping[str, str], best: Mapping[str, str], regime: str) -> Result:
+def fresh(sizes: Sizes, actions: Mapping[str, str], regime: str) -> Path:
+    """The folder of a combination's throws with the judge's seeds; equal combinations share it."""
     name = "judged_" + "_".join(actions.values())
     judge(sizes, name, actions, regime)
-    to_best = compared(sizes.folder / name, sizes.folder / "best", sizes.folder / "screen")
-    to_default = compared(sizes.folder / name, sizes.folder / "default", sizes.folder / "screen")
+    return sizes.folder / name
+
+
+def _judged(
+    sizes: Sizes,
+    seed: int,
+    actions: Mapping[str, str],
+    best: Mapping[str, str],
+    default: Mapping[str, str],
+    regime: str,
+) -> Result:
+    own, rho_of = fresh(sizes, actions, regime), sizes.folder / "screen"
+    to_best = compared(own, fresh(sizes, best, regime), rho_of)
+    to_default = compared(own, fresh(sizes, default, regime), rho_of)
     return {
         "learning seed": seed,
         **actions,
