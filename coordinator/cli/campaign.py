@@ -29,7 +29,7 @@ EXAMPLE = "petrobot campaign catch_ball --runs 200 --regime A,B --selector nikol
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
-    parser.add_argument("task", help="a task file, or the name of a task that comes with petrobot")
+    parser.add_argument("task", nargs="?", help="a task file, or the name of a task that comes with petrobot")
     parser.add_argument(
         "--runs", type=_positive, default=100, metavar="N", help="in all regimes together (%(default)s)"
     )
@@ -88,6 +88,8 @@ def run(options: argparse.Namespace) -> int:
     try:
         if options.resume is not None:
             folder, plan = options.resume, read_manifest(options.resume)
+        elif options.task is None:
+            raise CommandError(2, "give a TASK, or --resume FOLDER")
         else:
             task = load_task(options.task)
             _refuse_unfit(task, options.services)

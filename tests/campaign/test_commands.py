@@ -134,7 +134,7 @@ def test_a_killed_campaign_goes_on(tmp_path: Path) -> None:
     part.kill()
     part.wait()
     assert 0 < table.read_bytes().count(b"\n") < 61
-    assert start("x", "--resume", "part").wait() == 0
+    assert start("--resume", "part").wait() == 0
     assert start(*arguments, "--out", "whole").wait() == 0
     assert table.read_bytes() == (tmp_path / "whole" / "table.csv").read_bytes()
     sessions = (tmp_path / "part" / "sessions.csv").read_text(encoding="utf-8").splitlines()
@@ -151,7 +151,8 @@ def test_a_killed_campaign_goes_on(tmp_path: Path) -> None:
         (["campaign", *TOY, "--seed", "-1"], "0 or more"),
         (["campaign", *TOY, "--set", "speed=1"], "no parameter 'speed'"),
         (["campaign", str(TASK)], "may not run with"),
-        (["campaign", "x", "--resume", "nowhere"], "holds no campaign"),
+        (["campaign", "--resume", "nowhere"], "holds no campaign"),
+        (["campaign"], "give a TASK"),
         (["campaign", *TOY, "--learned", "nowhere"], "no finished campaign"),
         (["forecast", str(TASK)], "--estimates CAMPAIGN"),
         (["forecast", str(TASK), "--estimates", "nowhere.db"], "holds no estimates"),
