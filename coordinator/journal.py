@@ -11,6 +11,7 @@ Kinds of a mission run's journal: coordinator/recording.py. Why not SQLite: docs
 
 from __future__ import annotations
 
+import fcntl
 import os
 import struct
 import zlib
@@ -70,16 +71,27 @@ class JournalWriter:
             except OSError as fault:
                 text = f"{path}: {fault.strerror}; give --journal a folder that can be written"
                 raise JournalError(text) from fault
+            self._take(path)
             self._buffer += MAGIC
             self.next_number = 0
             self.append("header", {"format": FORMAT, **header})
             self.sync()
             _sync_folder(path.parent)
         else:
-            journal = read_journal(path)
             self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC)
+            self._take(path)
+            journal = read_journal(path)
             os.ftruncate(self._file, journal.good_bytes)
             self.next_number = len(journal.records) + 1
+
+    def _take(self, path: Path) -> None:
+        """Be the only writer for as long as this process lives: a run that goes on cannot be resumed beside itself."""
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as fault:
+            os.close(self._file)
+            text = f"{path}: another process writes it: the run goes on; end that process first if it hangs"
+            raise JournalError(text) from fault
 
     def append(self, kind: str, data: Mapping[str, Any]) -> int:
         """Add a record to the next sync; gives its number."""

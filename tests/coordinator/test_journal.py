@@ -116,6 +116,17 @@ def test_never_overwritten(tmp_path: Path) -> None:
         JournalWriter(path, {})
 
 
+def test_a_journal_has_one_writer_at_a_time(tmp_path: Path) -> None:
+    """A run that goes on is not resumed beside itself; once its process has let go, it is."""
+    path = tmp_path / "run.journal"
+    first = JournalWriter(path, {})
+    with pytest.raises(JournalError, match="another process writes it: the run goes on"):
+        JournalWriter(path)
+    assert len(read_journal(path).records) == 0, "it may be read all the time"
+    first.close()
+    JournalWriter(path).close()
+
+
 def test_a_place_where_no_journal_can_be_is_refused(tmp_path: Path) -> None:
     """A file stands where the folder should be."""
     (tmp_path / "runs").write_text("")

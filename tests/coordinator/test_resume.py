@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -52,6 +53,7 @@ class MortalStore(JournalStore):
     def _count(self) -> None:
         self.operations += 1
         if self.operations == self._lives:
+            os.close(self.writer._file)
             raise CrashError
 
     def append(self, now: float, stimulus: Stimulus, instructions: Sequence[Instruction], state: State) -> None:

@@ -85,6 +85,7 @@ def test_measured_processor_time_is_no_difference(tmp_path: Path) -> None:
     compared = store.safe
     store.stage("other", {})
     assert (compared, store.safe) == (True, False), "what is there is compared, what comes after it is written"
+    store.writer.close()
     again = RetracingStore(JournalWriter(path), read_journal(path))
     with pytest.raises(ReplayError, match="record 1 was stage"):
         again.stage("prepared", {})
