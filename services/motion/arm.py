@@ -82,7 +82,7 @@ class Arm:
         self._paused = False
         self._leased_until = 0.0
         self._after_stop = ""
-        self._commanded: deque[list[float]] = deque(maxlen=LAG_CYCLES + 1)
+        self._commanded: deque[Sequence[float]] = deque(maxlen=LAG_CYCLES + 1)
         self._off_path = 0.0
         self._measured = [0.0] * JOINTS
         self._measured_speed = [0.0] * JOINTS

@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from operator import sub
 from typing import NamedTuple
 
+from services.motion.clearance import Cup, Links, Point, Radii, Solids, Turn, clear, clear_step, farther, turned
 from services.motion.kinematics import Puma
-from services.motion.model import ArmModel, Cell
-from services.motion.trajectory import Trajectory
+from services.motion.model import JOINTS, ArmModel, Cell
+from services.motion.trajectory import Six, Trajectory, six
 
-Point = tuple[float, float, float]
+Geometry = tuple[Six, Six, Links, Radii, Cup, Solids]
+"""Least and greatest angles, and the rest of what services/motion/clearance.py asks for."""
 
 CUP_MARGIN = 0.005
 """m between cup and table."""
@@ -25,9 +26,15 @@ ARM_MARGIN = 0.01
 NEAR = 0.02
 """rad of braking below which the way to rest is too short (10 mm at the cup) to need a look at its middle."""
 LOOKS = (0.0, 0.25, 0.5)
-"""Shares of the braking time at which a long way to rest is looked at, besides its end."""
+"""Shares of the braking time at which a long way to rest is looked at, besides its end; the kernel has the same."""
 JOINT_SLACK = 1e-6
 """rad by which rounding may carry a command beyond a joint limit."""
+
+
+def point(values: Sequence[float]) -> Point:
+    """Three floats."""
+    x, y, z = values
+    return float(x), float(y), float(z)
 
 
 class Placement(NamedTuple):
@@ -55,19 +62,42 @@ class Guard:
         self._limits = list(zip(lowest.tolist(), highest.tolist(), strict=True))
         self._length = cell.cup.depth + cell.cup.wall
         self._radius = cell.cup.radius + cell.cup.wall
-        mouth, axis = cell.cup.mouth, cell.cup.axis
-        ends = (
-            math.hypot(*(m - length * a for m, a in zip(mouth, axis, strict=True))) for length in (0.0, self._length)
+        self._geometry = self._numbers()
+        self._warm_up()
+        self._vouched: Six | None = None
+        """Where `advance` left a trajectory, if it let it go on: the very tuple, so another trajectory's is never meant."""
+
+    def _warm_up(self) -> None:
+        """Kernels are compiled, or read from where they are kept, now and not in the servo's first cycles."""
+        home = Trajectory([0.0] * JOINTS, 0.004, [1.0] * JOINTS, [1.0] * JOINTS)
+        home.aim(home.q)
+        home.resting(*home.proposed())
+        home.braking()
+        self.violation(home.q)
+        self.advance(home)
+        self._vouched = None
+
+    def _numbers(self) -> Geometry:
+        """What the kernels must know: limits, links, radii, cup, and where the solids begin."""
+        puma, body, cell, cup = self._puma, self._body, self._cell, self._cell.cup
+        solids = (
+            cell.near_edge - self._arm_margin,
+            cell.near_edge - self._cup_margin,
+            cell.table_top + self._arm_margin,
+            cell.table_top + self._cup_margin,
+            self._arm_margin,
+            puma.d1 + body.base,
+            body.base + body.wrist + self._arm_margin,
+            body.base + self._radius + self._arm_margin,
         )
-        self._swing = max(ends) + self._radius
-        """m from the wrist's centre within which the whole cup is."""
-        self._thickest = max(self._body.forearm, self._body.wrist)
-        self._before_table = cell.near_edge - arm_margin
-        self._above_table = cell.table_top + arm_margin
-        self._above_pedestal = max(puma.d1 + self._body.base, self._above_table, arm_margin)
-        self._beside_pedestal = self._body.base + self._body.wrist + arm_margin
-        self._vouched: list[float] | None = None
-        """Where `advance` left a trajectory, if it let it go on: the very list, so another trajectory's is never meant."""
+        return (
+            six(self._model.lower - JOINT_SLACK),
+            six(self._model.upper + JOINT_SLACK),
+            (puma.d1, puma.a2, puma.a3, puma.d3, puma.d4),
+            (body.forearm, body.wrist),
+            (point(cup.mouth), point(cup.axis), self._length, self._radius),
+            solids,
+        )
 
     def closer(self, share: float) -> Guard:
         """A guard that keeps only a share of the margins."""
@@ -79,7 +109,7 @@ class Guard:
 
     def _placed(self, q: Sequence[float], elbow: Point, wrist: Point) -> Placement:
         turn = _turn(q)
-        offset, axis = _turned(turn, self._cell.cup.mouth), _turned(turn, self._cell.cup.axis)
+        offset, axis = turned(turn, self._cell.cup.mouth), turned(turn, self._cell.cup.axis)
         return Placement(elbow, wrist, (wrist[0] + offset[0], wrist[1] + offset[1], wrist[2] + offset[2]), axis)
 
     def _forearm(self, q: Sequence[float]) -> tuple[Point, Point]:
@@ -94,39 +124,18 @@ class Guard:
 
     def violation(self, q: Sequence[float]) -> str:
         """What a joint pose would touch, in words; empty if it is clear."""
+        if clear(six(q), *self._geometry):
+            return ""
         for angle, (low, high) in zip(q, self._limits, strict=True):
             if not low <= angle <= high:
                 return f"joint {self._beyond(q)} beyond its limit"
         elbow, wrist = self._forearm(q)
-        touched = "" if self._arm_far(elbow, wrist) else self._arm_touches(elbow, wrist)
-        if touched or self._far(wrist):
-            return touched
-        return self._cup_touches(self._placed(q, elbow, wrist))
+        return self._arm_touches(elbow, wrist) or self._cup_touches(self._placed(q, elbow, wrist))
 
     def _beyond(self, q: Sequence[float]) -> int:
         """The first joint beyond its limit, from 1."""
         pairs = zip(q, self._limits, strict=True)
         return next(number for number, (angle, (low, high)) in enumerate(pairs, 1) if not low <= angle <= high)
-
-    def _arm_far(self, elbow: Point, wrist: Point) -> bool:
-        """Whether the forearm's ends are so far from everything that all of it is clear: cheap, and most often so."""
-        thick = self._thickest
-        low = min(elbow[2], wrist[2]) - thick
-        return low >= self._above_pedestal or (
-            low >= self._arm_margin
-            and (max(elbow[0], wrist[0]) + thick <= self._before_table or low >= self._above_table)
-            and math.hypot(wrist[0], wrist[1]) >= self._beside_pedestal
-        )
-
-    def _far(self, wrist: Point) -> bool:
-        """Whether the wrist is so far from everything that the cup is clear however it is turned."""
-        x, y, z = wrist
-        inner = self._body.base + self._arm_margin + self._swing
-        return (
-            x + self._swing < self._cell.near_edge - self._cup_margin
-            and z - self._swing > self._arm_margin
-            and math.hypot(x, y) > inner
-        )
 
     def _cup_touches(self, at: Placement) -> str:
         """The cup as a cylinder: extents of its two end discs."""
@@ -173,11 +182,23 @@ class Guard:
 
         It brakes where it refuses; that this way is clear holds if the guard has watched from a clear pose on.
         """
-        q, qd = trajectory.proposed()
-        rest = trajectory.resting(q, qd)
-        refused = self.violation(rest)
-        if not refused and max(map(abs, map(sub, rest, q))) > NEAR:
-            refused = next(filter(None, map(self.violation, trajectory.stopping(q, qd, *LOOKS))), "")
+        target = trajectory.target
+        if target is None:
+            q, qd = trajectory.braking()
+            refused = self._refusal(trajectory, q, qd)
+        else:
+            q, qd, is_clear = clear_step(
+                trajectory.period,
+                NEAR,
+                trajectory.q,
+                trajectory.qd,
+                target,
+                trajectory.speed,
+                trajectory.acceleration,
+                trajectory.brakes,
+                *self._geometry,
+            )
+            refused = "" if is_clear else self._refusal(trajectory, q, qd)
         if refused:
             q, qd = trajectory.braking()
         else:
@@ -185,12 +206,20 @@ class Guard:
         trajectory.accept(q, qd)
         return refused
 
+    def _refusal(self, trajectory: Trajectory, q: Six, qd: Six) -> str:
+        """What the arm would touch where it comes to rest from this state, or on the way there; empty if nothing."""
+        rest = trajectory.resting(q, qd)
+        refused = self.violation(rest)
+        if not refused and farther(rest, q, NEAR):
+            refused = next(filter(None, map(self.violation, trajectory.stopping(q, qd, *LOOKS))), "")
+        return refused
+
     def stops_clear(self, trajectory: Trajectory) -> bool:
         """Whether the pose in which the trajectory comes to rest is clear; known at once if `advance` has just found it so."""
         return trajectory.q is self._vouched or not self.violation(trajectory.resting(trajectory.q, trajectory.qd))
 
 
-def _turn(q: Sequence[float]) -> tuple[float, ...]:
+def _turn(q: Sequence[float]) -> Turn:
     """Rotation of frame 6 in the base frame: cosine and sine of each angle on the way."""
     cos, sin, elbow = math.cos, math.sin, q[1] + q[2]
     return (
@@ -205,14 +234,3 @@ def _turn(q: Sequence[float]) -> tuple[float, ...]:
         cos(q[5]),
         sin(q[5]),
     )
-
-
-def _turned(turn: tuple[float, ...], vector: Point) -> Point:
-    """A vector of frame 6 in the base frame."""
-    c1, s1, c23, s23, c4, s4, c5, s5, c6, s6 = turn
-    x, y, z = vector
-    x, y = c6 * x - s6 * y, s6 * x + c6 * y
-    x, z = c5 * x - s5 * z, s5 * x + c5 * z  # the twists before and after joint 5 cancel
-    x, y = c4 * x - s4 * y, s4 * x + c4 * y
-    radial, up = c23 * x - s23 * z, s23 * x + c23 * z
-    return c1 * radial - s1 * y, s1 * radial + c1 * y, up

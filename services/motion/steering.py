@@ -9,7 +9,7 @@ import numpy as np
 
 from services.motion.limits import Guard
 from services.motion.model import Vector
-from services.motion.trajectory import Trajectory, synchronised
+from services.motion.trajectory import Six, Trajectory, synchronised
 
 CREEP: Final = 0.1
 """Share of the greatest speeds at which an arm leaves a pose that it should not be in."""
@@ -130,7 +130,7 @@ class Steering:
             and trajectory.arrived()
         )
 
-    def _rest(self) -> list[float]:
+    def _rest(self) -> Six:
         return self.trajectory.resting(self.trajectory.q, self.trajectory.qd)
 
     def _go_by(self, via: tuple[float, ...] | None) -> None:

@@ -5,19 +5,24 @@ ramp of whole cycles; that is the discrete time-optimal law (compare Kroeger, "O
 systems", 2010, type II) and needs no planning, so a new target costs nothing. Positions are the trapezoidal sums of the
 velocities: a drive that interpolates linearly in velocity follows them exactly.
 
-Plain floats, not arrays: six joints a cycle are too few for numpy to pay.
+Kernels on plain floats, not arrays: six joints a cycle are too few for numpy to pay.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
+from services.comm.compiled import kernel
 from services.motion.model import Vector
 
+Six = tuple[float, float, float, float, float, float]
+"""One number a joint, base to flange."""
 
+
+@kernel
 def next_velocity(error: float, velocity: float, period: float, speed: float, acceleration: float) -> float:
     """Velocity at the end of the next cycle (rad/s) of a joint that has `error` rad to go.
 
@@ -45,20 +50,108 @@ ROUNDING = 1e-9
 """Cycles by which rounding may carry a ramp of whole cycles; without it a ramp would restart one cycle longer each time."""
 
 
+@kernel
 def braking_velocity(velocity: float, period: float, acceleration: float) -> float:
     """Velocity at the end of the next cycle of a joint that comes to rest by an even ramp of whole cycles (rad/s)."""
     cycles = braking_cycles(velocity, period, acceleration)
     return velocity * (cycles - 1) / cycles if cycles else 0.0
 
 
+@kernel
 def braking_cycles(velocity: float, period: float, acceleration: float) -> int:
     """Whole cycles that the even ramp to rest takes."""
     return math.ceil(abs(velocity) / (acceleration * period) - ROUNDING)
 
 
+@kernel
 def braking_distance(velocity: float, period: float, acceleration: float) -> float:
     """What the even ramp of `braking_velocity` covers, with the velocity's sign (rad)."""
     return 0.5 * velocity * period * braking_cycles(velocity, period, acceleration)
+
+
+@kernel
+def _gone(period: float, q: Six, qd: Six, after: Six) -> Six:
+    half = 0.5 * period
+    return (
+        q[0] + half * (qd[0] + after[0]),
+        q[1] + half * (qd[1] + after[1]),
+        q[2] + half * (qd[2] + after[2]),
+        q[3] + half * (qd[3] + after[3]),
+        q[4] + half * (qd[4] + after[4]),
+        q[5] + half * (qd[5] + after[5]),
+    )
+
+
+@kernel
+def toward(period: float, q: Six, qd: Six, target: Six, speed: Six, acceleration: Six) -> tuple[Six, Six]:
+    """Positions and velocities at the end of the next cycle on the way to a target."""
+    after = (
+        next_velocity(target[0] - q[0], qd[0], period, speed[0], acceleration[0]),
+        next_velocity(target[1] - q[1], qd[1], period, speed[1], acceleration[1]),
+        next_velocity(target[2] - q[2], qd[2], period, speed[2], acceleration[2]),
+        next_velocity(target[3] - q[3], qd[3], period, speed[3], acceleration[3]),
+        next_velocity(target[4] - q[4], qd[4], period, speed[4], acceleration[4]),
+        next_velocity(target[5] - q[5], qd[5], period, speed[5], acceleration[5]),
+    )
+    return _gone(period, q, qd, after), after
+
+
+@kernel
+def to_rest(period: float, q: Six, qd: Six, brakes: Six) -> tuple[Six, Six]:
+    """Positions and velocities at the end of the next cycle when all joints brake."""
+    after = (
+        braking_velocity(qd[0], period, brakes[0]),
+        braking_velocity(qd[1], period, brakes[1]),
+        braking_velocity(qd[2], period, brakes[2]),
+        braking_velocity(qd[3], period, brakes[3]),
+        braking_velocity(qd[4], period, brakes[4]),
+        braking_velocity(qd[5], period, brakes[5]),
+    )
+    return _gone(period, q, qd, after), after
+
+
+@kernel
+def rest_of(period: float, q: Six, qd: Six, brakes: Six) -> Six:
+    """Where all joints come to rest if they brake from here."""
+    return (
+        q[0] + braking_distance(qd[0], period, brakes[0]),
+        q[1] + braking_distance(qd[1], period, brakes[1]),
+        q[2] + braking_distance(qd[2], period, brakes[2]),
+        q[3] + braking_distance(qd[3], period, brakes[3]),
+        q[4] + braking_distance(qd[4], period, brakes[4]),
+        q[5] + braking_distance(qd[5], period, brakes[5]),
+    )
+
+
+@kernel
+def braking_times(period: float, qd: Six, brakes: Six) -> Six:
+    """How long each joint's way to rest takes (s)."""
+    return (
+        period * braking_cycles(qd[0], period, brakes[0]),
+        period * braking_cycles(qd[1], period, brakes[1]),
+        period * braking_cycles(qd[2], period, brakes[2]),
+        period * braking_cycles(qd[3], period, brakes[3]),
+        period * braking_cycles(qd[4], period, brakes[4]),
+        period * braking_cycles(qd[5], period, brakes[5]),
+    )
+
+
+@kernel
+def _brakes_at(angle: float, velocity: float, now: float, time: float) -> float:
+    return angle + velocity * (now - 0.5 * now * now / time if now < time else 0.5 * time)
+
+
+@kernel
+def braked_for(now: float, q: Six, qd: Six, times: Six) -> Six:
+    """Where the joints are `now` seconds after they began to brake from here, ways to rest that take `times`."""
+    return (
+        _brakes_at(q[0], qd[0], now, times[0]),
+        _brakes_at(q[1], qd[1], now, times[1]),
+        _brakes_at(q[2], qd[2], now, times[2]),
+        _brakes_at(q[3], qd[3], now, times[3]),
+        _brakes_at(q[4], qd[4], now, times[4]),
+        _brakes_at(q[5], qd[5], now, times[5]),
+    )
 
 
 def reach_time(error: Vector, velocity: Vector, speed: Vector, acceleration: Vector) -> Vector:
@@ -87,8 +180,15 @@ def synchronised(error: Vector, speed: Vector, acceleration: Vector) -> tuple[Ve
     return speed * scale, acceleration * scale * scale
 
 
+_STILL: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 SLOWEST = 0.05
 """Least scale of a synchronised joint; a joint with nearly nothing to do may end early."""
+
+
+def six(values: Iterable[float]) -> Six:
+    """Six floats; raises ValueError for fewer or more."""
+    a, b, c, d, e, f = map(float, values)
+    return a, b, c, d, e, f
 
 
 class Trajectory:
@@ -102,67 +202,49 @@ class Trajectory:
         self, q: Sequence[float], period: float, speed: Sequence[float], acceleration: Sequence[float]
     ) -> None:
         self.period = period
-        self.q = [float(value) for value in q]
-        self.qd = [0.0] * len(self.q)
-        self.target: list[float] | None = None
-        self._brakes = [float(value) for value in acceleration]
+        self.q: Six = six(q)
+        self.qd: Six = _STILL
+        self.target: Six | None = None
+        self.brakes: Six = six(acceleration)
         self.limit(speed, acceleration)
 
     def limit(self, speed: Sequence[float], acceleration: Sequence[float]) -> None:
         """Go by these limits from now on (rad/s, rad/s^2, one a joint)."""
-        self.speed = [float(value) for value in speed]
-        self.acceleration = [float(value) for value in acceleration]
+        self.speed: Six = six(speed)
+        self.acceleration: Six = six(acceleration)
         if not (min(self.speed) > 0.0 and min(self.acceleration) > 0.0):
             raise ValueError(f"limits must be positive, are {self.speed} rad/s and {self.acceleration} rad/s^2")
 
     def aim(self, target: Sequence[float] | None) -> None:
         """Go to a joint pose, or come to rest."""
-        self.target = None if target is None else [float(value) for value in target]
+        self.target = None if target is None else six(target)
 
     def reset(self, q: Sequence[float]) -> None:
         """Stand still here."""
-        self.q, self.qd, self.target = [float(value) for value in q], [0.0] * len(self.q), None
+        self.q, self.qd, self.target = six(q), _STILL, None
 
-    def proposed(self) -> tuple[list[float], list[float]]:
+    def proposed(self) -> tuple[Six, Six]:
         """Position and velocity at the end of the next cycle toward the target."""
         if self.target is None:
             return self.braking()
-        period = self.period
-        after = [
-            next_velocity(target - q, v, period, speed, acceleration)
-            for target, q, v, speed, acceleration in zip(
-                self.target, self.q, self.qd, self.speed, self.acceleration, strict=True
-            )
-        ]
-        return [q + 0.5 * period * (v + w) for q, v, w in zip(self.q, self.qd, after, strict=True)], after
+        return toward(self.period, self.q, self.qd, self.target, self.speed, self.acceleration)
 
-    def braking(self) -> tuple[list[float], list[float]]:
+    def braking(self) -> tuple[Six, Six]:
         """Position and velocity at the end of the next cycle when all joints brake."""
-        period = self.period
-        after = [braking_velocity(v, period, a) for v, a in zip(self.qd, self._brakes, strict=True)]
-        return [q + 0.5 * period * (v + w) for q, v, w in zip(self.q, self.qd, after, strict=True)], after
+        return to_rest(self.period, self.q, self.qd, self.brakes)
 
-    def resting(self, q: Sequence[float], qd: Sequence[float]) -> list[float]:
+    def resting(self, q: Six, qd: Six) -> Six:
         """Where all joints come to rest if they brake from here."""
-        period = self.period
-        return [
-            angle + braking_distance(v, period, a) if v else angle
-            for angle, v, a in zip(q, qd, self._brakes, strict=True)
-        ]
+        return rest_of(self.period, q, qd, self.brakes)
 
-    def stopping(self, q: Sequence[float], qd: Sequence[float], *shares: float) -> Iterator[list[float]]:
+    def stopping(self, q: Six, qd: Six, *shares: float) -> Iterator[Six]:
         """Where the joints are after shares of the time that braking from here takes, the slowest joint deciding."""
-        period = self.period
-        times = [period * braking_cycles(v, period, a) for v, a in zip(qd, self._brakes, strict=True)]
+        times = braking_times(self.period, qd, self.brakes)
         longest = max(times)
         for share in shares:
-            now = share * longest
-            yield [
-                angle + v * (now - 0.5 * now**2 / time if now < time else 0.5 * time) if time else angle
-                for angle, v, time in zip(q, qd, times, strict=True)
-            ]
+            yield braked_for(share * longest, q, qd, times)
 
-    def accept(self, q: list[float], qd: list[float]) -> None:
+    def accept(self, q: Six, qd: Six) -> None:
         """Make a proposed or braking state the present one."""
         self.q, self.qd = q, qd
 

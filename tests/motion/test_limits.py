@@ -7,11 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from services.comm.compiled import COMPILED, plain
+from services.motion.clearance import Point, clear, clear_step
 from services.motion.kinematics import Puma
-from services.motion.limits import Guard, Point
+from services.motion.limits import LOOKS, NEAR, Guard
 from services.motion.model import nominal_arm, nominal_cell
 from services.motion.steering import CLOSER, Steering
-from services.motion.trajectory import Trajectory
+from services.motion.trajectory import Six, Trajectory, six
 
 ARM, CELL = nominal_arm(), nominal_cell()
 PUMA = Puma.of(ARM)
@@ -154,3 +156,36 @@ def test_a_rest_pose_found_clear_is_not_taken_for_another_arms(offset: tuple[flo
         guard.advance(moving)
         assert guard.stops_clear(moving) == (GUARD.violation(moving.resting(moving.q, moving.qd)) == "")
         assert not guard.stops_clear(stuck)
+
+
+SIX = st.tuples(*[st.floats(-2.0, 2.0, allow_subnormal=False)] * 6)
+
+
+@pytest.mark.skipif(not COMPILED, reason="numba is not installed (the extra `fast`)")
+@settings(max_examples=150, deadline=None)
+@given(angles=ANGLES, goal=ANGLES, share=SIX)
+def test_a_compiled_guard_gives_the_same_bits(angles: Six, goal: Six, share: Six) -> None:
+    """Commanded positions and velocities and what is found clear, compiled and as it stands."""
+    qd = six(0.5 * s * v for s, v in zip(share, ARM.speed.tolist(), strict=True))
+    limits = six(ARM.speed), six(ARM.acceleration), six(ARM.acceleration)
+    numbers = 0.004, NEAR, angles, qd, goal, *limits, *GUARD._geometry
+    assert repr(clear_step(*numbers)) == repr(plain(clear_step)(*numbers))
+    assert clear(angles, *GUARD._geometry) == plain(clear)(angles, *GUARD._geometry)
+
+
+@settings(max_examples=150, deadline=None)
+@given(goal=ANGLES, share=SIX)
+def test_a_clear_step_can_stop_anywhere_on_its_way(goal: Six, share: Six) -> None:
+    """The guard's one look at a step finds what looking at each of the poses finds, one by one."""
+    trajectory = Trajectory(HOME.tolist(), 0.004, ARM.speed.tolist(), ARM.acceleration.tolist())
+    trajectory.qd = six(0.5 * s * v for s, v in zip(share, ARM.speed.tolist(), strict=True))
+    trajectory.aim(goal)
+    q, qd = trajectory.proposed()
+    rest = trajectory.resting(q, qd)
+    poses = [rest]
+    if max(abs(a - b) for a, b in zip(rest, q, strict=True)) > NEAR:
+        poses += trajectory.stopping(q, qd, *LOOKS)
+    refused = next(filter(None, map(GUARD.violation, poses)), "")
+    braked = trajectory.braking()
+    assert GUARD.advance(trajectory) == refused
+    assert (trajectory.q, trajectory.qd) == (braked if refused else (q, qd))
