@@ -8,6 +8,7 @@ from typing import Any
 
 from aiohttp import web
 
+from coordinator.analysing import analyse_apart
 from coordinator.hmi import verdicts
 from coordinator.hmi.edits import EditError, Rename, parse, plain
 from coordinator.hmi.house import HOUSE, House
@@ -23,6 +24,7 @@ def add_routes(app: web.Application) -> None:
     app.router.add_get("/api/tasks/{name}", _open)
     app.router.add_put("/api/tasks/{name}", _save)
     app.router.add_post("/api/check", _check)
+    app.router.add_post("/api/analyse", _analyse)
     app.router.add_get("/api/tasks/{name}/export/{form}", _export)
     app.router.add_post("/api/import", _import)
     app.router.add_get("/api/offers", _offers)
@@ -72,6 +74,22 @@ async def _check(request: web.Request) -> web.Response:
         raise _refusal(fault) from fault
     findings = await asyncio.to_thread(verdicts.findings, text, f"{name}.toml", _where(house))
     return json_answer({"findings": findings, "text": text})
+
+
+async def _analyse(request: web.Request) -> web.Response:
+    """{name, document}: verdicts on a document that is being drawn, and where its time goes; one analysis at a time."""
+    house = request.app[HOUSE]
+    body = await read_object(request)
+    name = str(body.get("name") or "new_task")
+    try:
+        current = house.store.read(name) if name in house.store.names() else None
+        text = house.store.edited_text(current, _document(body), _renames(body))
+        async with house.analysing:
+            return json_answer(await analyse_apart(text, f"{name}.toml"))
+    except StoreError as fault:
+        raise _refusal(fault) from fault
+    except ValueError as fault:
+        raise web.HTTPUnprocessableEntity(text=str(fault)) from fault
 
 
 async def _export(request: web.Request) -> web.Response:

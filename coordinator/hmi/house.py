@@ -35,6 +35,7 @@ class House:
     gate: Gate | None = None
     sessions: set[Session] = field(default_factory=set)
     commands: set[asyncio.Task[None]] = field(default_factory=set)
+    analysing: asyncio.Lock = field(default_factory=asyncio.Lock)
     closing: bool = False
     _heard: dict[str, float] = field(default_factory=dict)
     _encoded: OrderedDict[tuple[int, int], str] = field(default_factory=OrderedDict)

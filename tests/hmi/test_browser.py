@@ -689,3 +689,24 @@ async def test_the_stop_is_within_reach_of_every_dialog(browser: Browser, page: 
     await tab.keyboard.press("Escape")
     await expect(dialog).to_be_hidden()
     assert [verb for _, verb, _ in stage.commands] == ["estop", "estop"]
+
+
+async def test_verdicts_stand_beside_the_drawing(browser: Browser, page: Page, shots: Path, faults: Watch) -> None:
+    """A task that may stop short of its end is told by itself; a press shows the marking and the firings that lead there."""
+    tab = await designer(browser, page)
+    complaints = faults(tab)
+    analysis = tab.get_by_role("region", name="Analysis")
+    await expect(analysis.get_by_role("status")).to_contain_text("nothing against it")
+    field = tab.get_by_label("Ends when")
+    await field.fill("parts == 0 and look == 1")
+    await field.press("Enter")
+    await expect(analysis.get_by_role("status")).to_contain_text("5 against it")
+    refused = analysis.get_by_role("button", name=re.compile("^Never stuck before its end: does not hold"))
+    await expect(element(tab, "^Control place parts, 2 tokens")).to_be_visible()
+    await refused.click()
+    await expect(element(tab, "^Control place parts(, no tokens|, 0 tokens)?$")).to_be_visible()
+    await expect(tab.locator(".net .turns").first).to_be_visible()
+    await tab.screenshot(path=shots / "verdicts.png")
+    await refused.click()
+    await expect(element(tab, "^Control place parts, 2 tokens")).to_be_visible()
+    assert complaints == []

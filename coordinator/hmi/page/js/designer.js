@@ -12,6 +12,7 @@ import { automatic, placed } from "./layout.js";
 import { emptyDocument, Model } from "./model.js";
 import { Pointer } from "./pointer.js";
 import { toast } from "./toast.js";
+import { Verdicts } from "./verdicts.js";
 
 const CHECK_MS = 300;
 const NEARLY = 16;
@@ -35,9 +36,10 @@ export class Designer {
     this.inspector = new Inspector(this);
     this.buildBars();
     this.strip = h("section", { class: "strip", "aria-label": "Findings" });
+    this.verdicts = new Verdicts(this);
     this.hint = h("p", { class: "hint", role: "status" });
     this.canvas.root.append(this.hint);
-    this.root = h("div", { class: "designer" }, this.bar, this.box, this.canvas.root, this.inspector.root, this.strip);
+    this.root = h("div", { class: "designer" }, this.bar, this.box, this.canvas.root, this.inspector.root, h("div", { class: "below" }, this.strip, this.verdicts.root));
     this.model = new Model((why) => this.changed(why));
     this.use("select");
   }
@@ -198,6 +200,7 @@ export class Designer {
     this.model ??= null;
     if (!this.model) return;
     this.pruneSelection();
+    this.verdicts.forget();
     this.draw();
     this.inspector.show(this.selection);
     this.paintState();
@@ -224,6 +227,7 @@ export class Designer {
     if (this.selection.arc) this.selection.arc = this.picture.arcs.find((a) => a.id === this.selection.arc.id) ?? null;
     this.canvas.show(this.picture);
     for (const place of this.picture.places) this.view.tokens(place.name, place.tokens);
+    this.verdicts.paint();
     this.canvas.trail([this.model.data.task?.name || "task", ...(this.model.sheet ? [this.model.sheet] : [])], () => this.openSheet(""));
     this.paintSelection();
     this.paintFindings();
@@ -237,6 +241,7 @@ export class Designer {
     this.findings = said.findings;
     this.text = said.text;
     this.paintFindings();
+    if (!this.findings.some((f) => f.severity === "error")) this.verdicts.soon();
     this.inspector.show(this.selection);
   }
 

@@ -40,6 +40,16 @@ export async function checkDocument(name, document, renames) {
   }
 }
 
+/** Verdicts on a document; a text says why there are none. */
+export async function analyseDocument(name, document, renames) {
+  try {
+    const answer = await ask("POST", "/api/analyse", { name, document, renames });
+    return answer.ok ? answer.value : String(answer.value);
+  } catch {
+    return "the server cannot be reached";
+  }
+}
+
 /** Save; on a conflict the person chooses. Gives what the server then has, or null. */
 export async function saveTask(model, name) {
   const path = `/api/tasks/${encodeURIComponent(name)}`;

@@ -1,0 +1,102 @@
+// What the analysis says of the task that is drawn: verdicts, the firings that speak against it, and where its time goes.
+
+import { attribute, fill, h, s } from "./dom.js";
+import { analyseDocument } from "./files.js";
+import { icon } from "./icons.js";
+
+const SETTLED_MS = 1500;
+const SIGN = { true: "check", false: "error", null: "info" };
+const SAID = { true: "holds", false: "does not hold", null: "not known" };
+
+export class Verdicts {
+  constructor(designer) {
+    this.designer = designer;
+    this.list = h("ul", {});
+    this.head = h("span", { class: "muted", role: "status" });
+    this.button = h("button", { type: "button", class: "small", onclick: () => this.analyse() }, "Analyse");
+    this.heatButton = h("button", { type: "button", class: "small", "aria-pressed": "false", hidden: true, onclick: () => this.toggleHeat() }, "Bottleneck");
+    this.root = h("section", { class: "strip verdicts", "aria-label": "Analysis" }, h("h2", {}, "Analysis", this.head, h("div", { class: "spacer" }), this.heatButton, this.button), this.list);
+    this.heat = {};
+  }
+
+  /** The document changed: what was said no longer counts. */
+  forget() {
+    clearTimeout(this.later);
+    this.asked = null;
+    this.shown = null;
+    this.hot = false;
+    this.heat = {};
+    this.heatButton.hidden = true;
+    attribute(this.heatButton, "aria-pressed", "false");
+    this.head.textContent = "";
+    fill(this.list);
+  }
+
+  /** The check found no fault: analyse once the drawing has settled, unless a mission goes on. */
+  soon() {
+    clearTimeout(this.later);
+    const busy = () => ["running", "preparing", "stopping"].includes(this.designer.link.state.mission.state);
+    this.later = setTimeout(() => !this.designer.root.hidden && !busy() && this.analyse(), SETTLED_MS);
+  }
+
+  async analyse() {
+    clearTimeout(this.later);
+    const { model } = this.designer;
+    const document = model.data;
+    if (this.asked === document) return;
+    this.asked = document;
+    this.head.textContent = "working …";
+    const answer = await analyseDocument(model.name, document, model.renames);
+    if (this.asked !== document) return; // it was edited meanwhile
+    this.asked = null;
+    if (typeof answer === "string") {
+      this.head.textContent = answer;
+      return;
+    }
+    const against = answer.verdicts.filter((v) => v.holds === false).length;
+    this.head.textContent = `${against ? `${against} against it` : "nothing against it"}, ${answer.markings} markings${answer.complete ? "" : " looked at, not all"}`;
+    this.heat = answer.heat;
+    this.heatButton.hidden = !Object.keys(answer.heat).length;
+    fill(this.list, answer.verdicts.map((v) => this.row(v)));
+  }
+
+  row(verdict) {
+    const { witness } = verdict;
+    const button = h("button", { type: "button", disabled: verdict.holds !== false || !witness, "aria-pressed": "false", onclick: () => this.show(verdict, button) },
+      icon(SIGN[verdict.holds]), h("strong", {}, `${verdict.words}: ${SAID[verdict.holds]}`), h("span", {}, verdict.reason, witness && verdict.holds === false ? `. By: ${witness.firings.join(", ") || "the initial marking"}.` : ""));
+    return h("li", { class: verdict.holds === false ? "error" : "" }, button);
+  }
+
+  /** The marking that speaks against it, with the turns in which transitions fired; a second press takes it away. */
+  show(verdict, button) {
+    const again = this.shown === verdict;
+    this.shown = again ? null : verdict;
+    for (const other of this.list.querySelectorAll("button")) attribute(other, "aria-pressed", String(other === button && !again));
+    this.designer.openSheet("");
+    this.paint();
+  }
+
+  toggleHeat() {
+    this.hot = !this.hot;
+    attribute(this.heatButton, "aria-pressed", String(this.hot));
+    this.paint();
+  }
+
+  /** Put what is chosen here onto the drawing. */
+  paint() {
+    const { view, picture } = this.designer;
+    const witness = this.shown?.witness;
+    const turns = new Map();
+    [...(witness?.firings ?? []), ...(witness?.loop ?? [])].forEach((name, i) => turns.set(name, [...(turns.get(name) ?? []), i + 1]));
+    const inside = (name) => Object.entries(witness.marking).reduce((sum, [place, n]) => sum + (place === name || place.startsWith(`${name}.`) ? n : 0), 0);
+    for (const place of picture.places) view.tokens(place.name, witness ? inside(place.name) : place.tokens);
+    for (const element of view.elements.values()) {
+      const share = this.hot ? this.heat[element.name] : undefined;
+      element.node.classList.toggle("hot", share !== undefined);
+      element.node.style.setProperty("--heat", `${Math.round(100 * (share ?? 0))}%`);
+      element.turns?.remove();
+      element.turns = turns.has(element.name) ? s("text", { class: "turns", y: 4 }, turns.get(element.name).join(", ")) : null;
+      if (element.turns) element.node.append(element.turns);
+    }
+  }
+}
