@@ -21,7 +21,7 @@ from services.mobile.sight import End, TrackAhead, TrackEnd
 
 Vector = NDArray[np.float64]
 
-CAPACITY = 1000
+CAPACITY = 640
 """Points kept; the oldest go."""
 STEP = 0.015
 """m or, turning, about as many degrees between two places from which sights are taken."""
