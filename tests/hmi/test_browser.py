@@ -351,6 +351,21 @@ async def test_a_lost_connection_is_plain_to_see(
         await again.close()
 
 
+async def labels_are_clear_of_each_other(tab: Tab) -> None:
+    """Labels of detections stand inside their image, and none covers another."""
+    picture = await tab.get_by_role("img", name="Image of table").bounding_box()
+    labels = await tab.locator(".detection-label").all()
+    boxes = [box for label in labels if (box := await label.bounding_box())]
+    assert picture is not None and len(boxes) == 3
+    for box in boxes:
+        assert box["x"] >= picture["x"] - 1 and box["x"] + box["width"] <= picture["x"] + picture["width"] + 1
+    for i, a in enumerate(boxes):
+        for b in boxes[i + 1 :]:
+            beside = a["x"] + a["width"] <= b["x"] + 1 or b["x"] + b["width"] <= a["x"] + 1
+            above = a["y"] + a["height"] <= b["y"] + 1 or b["y"] + b["height"] <= a["y"] + 1
+            assert beside or above
+
+
 async def test_details(browser: Browser, page: Page, stage: Stage, shots: Path, faults: Watch) -> None:
     """Camera with detections, devices, set-point latency, learning curves, events, variables; on a wall screen too."""
     tab = await opened(browser, page, "dark")
@@ -360,6 +375,8 @@ async def test_details(browser: Browser, page: Page, stage: Stage, shots: Path, 
     seen = [
         {"kind": "circle", "x": 300, "y": 200, "r": 20, "label": "part"},
         {"kind": "path", "points": [[0, 0], [9, 9]]},
+        {"kind": "circle", "x": 628, "y": 180, "r": 10, "label": "ball"},
+        {"kind": "point", "role": "predicted", "x": 634, "y": 186, "label": "predicted exit"},
     ]
     image = {"mime": "image/png", "data": pixel, "width": 640, "height": 360, "age": 0.02, "detections": seen}
     stage.feed.emit("image", name="table", image=image)
@@ -372,6 +389,8 @@ async def test_details(browser: Browser, page: Page, stage: Stage, shots: Path, 
     await tab.get_by_role("tab", name="Camera").click()
     await expect(tab.get_by_role("img", name="Image of table")).to_be_visible()
     await expect(tab.get_by_role("tabpanel", name="Camera")).to_contain_text("20 ms old")
+    await labels_are_clear_of_each_other(tab)
+    await tab.screenshot(path=shots / "camera.png")
     await tab.get_by_role("tab", name="Devices").click()
     await expect(tab.get_by_role("tabpanel", name="Devices")).to_contain_text("enabled")
     await tab.get_by_role("tab", name="Set points").click()

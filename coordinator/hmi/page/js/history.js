@@ -132,6 +132,8 @@ export class History {
   }
 
   controlsChanged() {
+    const { mission } = this.link.state;
+    this.startHere.hidden = mission.starts === false || mission.file !== undefined; // a real cell cannot begin in the middle
     this.startHere.disabled = !this.link.mayAct || !this.reel?.run.task;
     attribute(this.startHere, "title", this.link.mayAct ? null : "Take the controls first");
   }
