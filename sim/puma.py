@@ -104,6 +104,12 @@ class ArmPlant:
         self._bias = self._body.bias(self.q, self.qd)
         self.slow_down(speed_factor)
         self._refresh()
+        self._warm_up()
+
+    def _warm_up(self) -> None:
+        """Kernels are compiled, or read from where they are kept, now and not when the arm first moves."""
+        held(motors(_REST, self._limit, self.qd, self._greatest), self._bias, self._stick)
+        self._stepped(0.001, _REST, self._bias)
 
     @property
     def braked(self) -> tuple[bool, ...]:
@@ -141,7 +147,11 @@ class ArmPlant:
             self._refresh()
         self._bias = bias = self._body.bias(self.q, self.qd)
         self.moves += 1
-        self.q, self.qd, self._friction, self.still = stepped(
+        self.q, self.qd, self._friction, self.still = self._stepped(dt, asked, bias)
+
+    def _stepped(self, dt: float, asked: Six, bias: Six) -> tuple[Six, Six, Six, bool]:
+        """Angles, speeds and dry friction after `dt`, and whether the arm then stands still."""
+        return stepped(
             dt,
             self.q,
             self.qd,
