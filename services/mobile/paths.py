@@ -73,7 +73,8 @@ def join(begin: Pose, end: Pose, beyond: float) -> Points:
 def passes(points: Sequence[tuple[float, float]], gate: Pose, aside: float, turn: float) -> bool:
     """Whether a line seen as points (near to far) leads through a gate: within `aside` m of it, `turn` rad of its heading.
 
-    The line counts as going on straight for half a metre before its first point and after its last.
+    The line counts as going on straight for half a metre before its first point and after its last. One that is seen the
+    other way round, by a rover that has gone too far and looks back, does not count: it would be followed backwards.
     """
     near, far = points[0], points[-1]
     direction = math.atan2(far[1] - near[1], far[0] - near[0])
@@ -86,5 +87,4 @@ def passes(points: Sequence[tuple[float, float]], gate: Pose, aside: float, turn
         return False
     i = min(closest, len(places) - 2)
     local = math.atan2(places[i + 1][1] - places[i][1], places[i + 1][0] - places[i][0])
-    off = abs(turned(local - gate.heading))
-    return min(off, math.pi - off) < turn
+    return abs(turned(local - gate.heading)) < turn
