@@ -41,6 +41,7 @@ bench: $(VENV)/.ready
 	$(BIN)/python tests/bench/estop.py
 	$(BIN)/python tests/bench/doors.py
 	$(BIN)/python tests/bench/journal.py
+	$(BIN)/python tests/bench/durability.py
 	$(BIN)/python -m tests.bench.analysis
 	$(BIN)/python -m tests.bench.learning
 
