@@ -55,6 +55,7 @@ export class Verdicts {
     }
     const against = answer.verdicts.filter((v) => v.holds === false).length;
     this.head.textContent = `${against ? `${against} against it` : "nothing against it"}, ${answer.markings} markings${answer.complete ? "" : " looked at, not all"}`;
+    attribute(this.root, "data-state", against ? "error" : null);
     this.heat = answer.heat;
     this.heatButton.hidden = !Object.keys(answer.heat).length;
     fill(this.list, answer.verdicts.map((v) => this.row(v)));
