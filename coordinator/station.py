@@ -1,8 +1,8 @@
 """A coordinator that stays: one page over any number of mission runs, idle until the operator starts one.
 
-Implements `coordinator.hmi.port.MissionPort`. The feed and who holds the controls outlive each run; a run in real time is led by
-`coordinator.operation.Operation`, one by chance alone by `coordinator.rehearsal.Rehearsal`. What is idle is looked after here:
-which nodes are up, breakpoints and choices for the next run, and the emergency stop.
+Implements `coordinator.hmi.port.MissionPort`. The feed and who holds the controls outlive each run, which
+`coordinator.mission_run.MissionRun` leads. What is idle is looked after here: which nodes are up, breakpoints and choices for the
+next run, and the emergency stop.
 """
 
 from __future__ import annotations
