@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -71,14 +71,14 @@ class CupMount:
         self._mouth = _triple(mouth)
         self._bottom = _triple(mouth - truth.cup.depth * axis)
 
-    def frame(self, q: list[float]) -> Frame3:
+    def frame(self, q: Sequence[float]) -> Frame3:
         """The cup's frame at encoder angles (six, rad): origin in the middle of the mouth, z out of it."""
         flange = self._arm.flange_frame(self._true(q))
         at = flange.origin
         x, y, z = (_minus(flange.point(axis), at) for axis in (self._x, self._y, self._z))
         return Frame3(x, y, z, flange.point(self._mouth))
 
-    def solid_parts(self, q: list[float]) -> tuple[Any, Any]:
+    def solid_parts(self, q: Sequence[float]) -> tuple[Any, Any]:
         """Capsules of the arm at encoder angles: end points (6, 2, 3) and radii (6,), m, base frame."""
         return self._arm.solid_parts(self._true(q), self._bottom)
 

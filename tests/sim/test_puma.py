@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -32,7 +33,7 @@ def angles(arm: ArmModel, shares: list[float]) -> list[float]:
     return (middle + half * np.array(shares)).tolist()  # type: ignore[no-any-return]
 
 
-def potential_energy(arm: ArmModel, q: list[float]) -> float:
+def potential_energy(arm: ArmModel, q: Sequence[float]) -> float:
     """From masses and heights alone (J)."""
     frames = arm.frames(q)
     return sum(
