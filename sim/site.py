@@ -89,7 +89,7 @@ class CupMount:
         inertia = tuple(along * a * a + across * (1.0 - a * a) for a in self._z)
         return Link(mass, (middle[0], middle[1], middle[2]), (inertia[0], inertia[1], inertia[2]))
 
-    def _true(self, q: list[float]) -> list[float]:
+    def _true(self, q: Sequence[float]) -> list[float]:
         return [angle + zero for angle, zero in zip(q, self._zero, strict=True)]
 
 
