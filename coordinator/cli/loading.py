@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 SHIPPED = Path(__file__).parents[1] / "tasks"
 """Tasks that come with petrobot; they are known by their bare names."""
+OWN = Path("tasks")
+"""Where the operator's page saves tasks: beside what one works on."""
 
 
 def add_services_argument(parser: argparse.ArgumentParser) -> None:
@@ -29,10 +31,13 @@ def add_services_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def task_path(name: str) -> Path:
-    """The file of a task given by path or by the bare name of a shipped one."""
+    """The file of a task given by path, or by its bare name: one's own in `tasks` here, else a shipped one."""
     path = Path(name)
-    if path.suffix == ".toml" or path.exists():
+    if path.suffix == ".toml" or path.is_file():
         return path
+    own = OWN / f"{name}.toml"
+    if own.exists():
+        return own
     shipped = SHIPPED / f"{name}.toml"
     if shipped.exists():
         return shipped

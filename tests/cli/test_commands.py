@@ -175,3 +175,14 @@ def test_lockstep_run_writes_the_promised_file(tmp_path: Path) -> None:
     assert all({"n", "speed", "caught", "miss_mm", "status"} <= set(throw) for throw in results[0]["throws"])
     assert len(results[0]["throws"]) == 2
     assert {**results[0], "wall_s": 0} == {**results[1], "wall_s": 0}
+
+
+def test_a_task_of_ones_own_comes_before_a_shipped_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the page saved under `tasks` is found by its bare name."""
+    from coordinator.cli.loading import SHIPPED, task_path
+
+    monkeypatch.chdir(tmp_path)
+    assert task_path("catch_ball") == SHIPPED / "catch_ball.toml"
+    (tmp_path / "tasks").mkdir()
+    (tmp_path / "tasks" / "catch_ball.toml").write_text("schema = 1\n", encoding="utf-8")
+    assert task_path("catch_ball") == Path("tasks/catch_ball.toml")
