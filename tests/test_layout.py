@@ -48,6 +48,18 @@ PURE = (
     "services.motion.interception",
     "services.vision.location",
     "services.vision.prediction",
+    "services.mobile.floor",
+    "services.mobile.candidates",
+    "services.mobile.detection",
+    "services.mobile.line_end",
+    "services.mobile.sight",
+    "services.mobile.watching",
+    "services.mobile.odometry",
+    "services.mobile.track_map",
+    "services.mobile.following",
+    "services.mobile.paths",
+    "services.mobile.reflectors",
+    "services.mobile.wheel_drives",
 )
 IMPURE_IMPORTS = {"asyncio", "socket", "selectors", "subprocess", "threading", "multiprocessing", "random", "secrets"}
 FORBIDDEN_IMPORTS = {"pickle", "marshal", "shelve", "dill", "cloudpickle"}
