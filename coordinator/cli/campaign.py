@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 from coordinator.cli import CommandError
 from coordinator.cli.loading import (
     add_services_argument,
+    cell_path,
     load_directory,
     load_task,
-    services_path,
     task_path,
     write_json,
 )
@@ -92,6 +92,7 @@ def run(options: argparse.Namespace) -> int:
             raise CommandError(2, "give a TASK, or --resume FOLDER")
         else:
             task = load_task(options.task)
+            options.services = cell_path(options.services, options.task, task)
             _refuse_unfit(task, options.services)
             plan = _plan(options, task)
             folder = options.out or Path("campaigns") / f"{task.name}-{plan.selector}-{plan.seed}-{identity(plan)[:6]}"
@@ -177,7 +178,7 @@ def _plan(options: argparse.Namespace, task: Task) -> Plan:
     if len(set(regimes)) < len(regimes):
         raise CommandError(2, f"--regime {options.regime}: name each regime once")
     chosen = dict(_pair("--choose", text) for text in options.choose.split(",") if text)
-    paths = {"task": str(task_path(options.task)), "services": str(services_path(options.services))}
+    paths = {"task": str(task_path(options.task)), "services": str(options.services)}
     paths |= {"mock": str(options.mock)} if options.mock else {}
     return Plan(
         **{key: str(Path(path).resolve()) for key, path in paths.items()},

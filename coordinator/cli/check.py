@@ -7,7 +7,7 @@ import asyncio
 import time
 from typing import TYPE_CHECKING
 
-from coordinator.cli.loading import add_services_argument, load_directory, load_task, services_path, write_json
+from coordinator.cli.loading import add_services_argument, cell_path, load_directory, load_task, write_json
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -39,11 +39,12 @@ def run(options: argparse.Namespace) -> int:
 
     task = load_task(options.task)
     offers: dict[str, str] | None = None
-    if options.services is not None or services_path(None).exists():
-        directory = load_directory(options.services)
+    services = cell_path(options.services, options.task, task)
+    if options.services is not None or services.exists():
+        directory = load_directory(services)
         offers = {action: directory.where(action) for action in directory.actions}
     report = check(task, offers)
-    missing = _missing(task, options.services) if options.live else []
+    missing = _missing(task, services) if options.live else []
     analysis = None if report.errors else _analysed(task)
     ok = report.ok and (analysis is None or not _stuck(analysis))
     live = {"live": missing} if options.live else {}

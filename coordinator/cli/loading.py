@@ -66,6 +66,13 @@ def services_path(given: Path | None) -> Path:
     return here if here.exists() else Path(__file__).parents[2] / "services.toml"
 
 
+def cell_path(given: Path | None, name: str, task: Task) -> Path:
+    """services.toml for a task, which was named so on the command line: the given one, the task's own, or the one at hand."""
+    if given is None and task.services:
+        return task_path(name).parent / task.services
+    return services_path(given)
+
+
 def load_directory(given: Path | None) -> Directory:
     """Read services.toml."""
     from services.comm.directory import DirectoryError, load

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from coordinator.cli import CommandError
 from coordinator.cli.journaling import add_journal_arguments, journal_folder, new_store, tidy
 from coordinator.cli.learning import add_learning_arguments, opened, saved
-from coordinator.cli.loading import add_services_argument, load_directory, load_task, write_json
+from coordinator.cli.loading import add_services_argument, cell_path, load_directory, load_task, write_json
 
 if TYPE_CHECKING:
     from coordinator.launch import Setting
@@ -82,7 +82,9 @@ def run(options: argparse.Namespace) -> int:
     from coordinator.mission import MissionError
     from services.comm.directory import DirectoryError
 
-    directory, task = load_directory(options.services), load_task(options.task)
+    task = load_task(options.task)
+    options.services = cell_path(options.services, options.task, task)
+    directory = load_directory(options.services)
     if options.join and (options.mode != "lockstep" or options.processes != 0):
         raise CommandError(2, "--join is for --mode lockstep --processes 0: nodes in real time are joined always")
     _refuse_unfit(task, directory)

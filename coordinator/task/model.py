@@ -324,6 +324,8 @@ class Task:
     score: str = ""
     """Service that is called at its end and gives the task's own results; empty: none."""
     text: str = ""
+    services: str = ""
+    """Location file that the task is usually run with, relative to the task's own file; empty: the one at hand."""
 
     @cached_property
     def flat(self) -> Task:

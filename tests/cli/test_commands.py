@@ -186,3 +186,17 @@ def test_a_task_of_ones_own_comes_before_a_shipped_one(tmp_path: Path, monkeypat
     (tmp_path / "tasks").mkdir()
     (tmp_path / "tasks" / "catch_ball.toml").write_text("schema = 1\n", encoding="utf-8")
     assert task_path("catch_ball") == Path("tasks/catch_ball.toml")
+
+
+def test_a_task_may_name_its_own_location_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """`services` of the task file is found from anywhere and gives way to --services; it survives writing and reading."""
+    from coordinator.cli.loading import SHIPPED, cell_path
+    from coordinator.taskfile import dumps, load, loads
+
+    monkeypatch.chdir(tmp_path)
+    task = load(SHIPPED / "follow_track.toml")
+    assert loads(dumps(task)).services == task.services != ""
+    assert cell_path(None, "follow_track", task).resolve() == ROOT / "services" / "mobile" / "track.services.toml"
+    assert cell_path(Path("mine.toml"), "follow_track", task) == Path("mine.toml")
+    assert cell_path(None, "catch_ball", load(SHIPPED / "catch_ball.toml")) == ROOT / "services.toml"
+    assert main(["check", "follow_track"]) == 0
