@@ -10,6 +10,7 @@ from coordinator.cli import CommandError
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Mapping
 
     from coordinator.task import Task
     from services.comm.directory import Directory
@@ -84,6 +85,21 @@ def load_directory(given: Path | None) -> Directory:
         raise CommandError(2, f"{path}: {fault.strerror or fault}") from fault
     except DirectoryError as fault:
         raise CommandError(2, str(fault)) from fault
+
+
+def pictures_of(task: Task, result: Mapping[str, Any]) -> dict[str, str]:
+    """What the task's own function draws of a mission run's result, SVG by title. Raises CommandError when it cannot be had."""
+    if not task.pictures:
+        return {}
+    from coordinator.launch import load_object
+
+    try:
+        draw = load_object(task.pictures)
+    except (ImportError, AttributeError, ValueError) as fault:
+        raise CommandError(
+            2, f"task.pictures = {task.pictures!r}: {fault}; name a function as module:function"
+        ) from fault
+    return dict(draw(result))
 
 
 def write_json(path: str, data: Any) -> None:

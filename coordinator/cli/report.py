@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
-from coordinator.cli.loading import load_task, write_json
+from coordinator.cli.loading import load_task, pictures_of, write_json
 
 if TYPE_CHECKING:
     from coordinator.campaign.plan import Plan
@@ -160,6 +160,8 @@ def _run(name: str) -> tuple[str, dict[str, str], Path]:
         if path.exists()
         else {"task": found.task.name, "reason": "no result"}
     )
-    page = report_html({**result, "mission": header["mission"]}, timeline, draw(found.task, error_branches=True))
-    pictures = {f"own_{i}": svg for i, svg in enumerate(own_pictures(result).values(), 1)}
+    drawn = pictures_of(found.task, result)
+    net = draw(found.task, error_branches=True)
+    page = report_html({**result, "mission": header["mission"]}, timeline, net, drawn)
+    pictures = {f"own_{i}": svg for i, svg in enumerate([*own_pictures(result).values(), *drawn.values()], 1)}
     return page, {"gantt": gantt_svg(timeline), **pictures}, folder / "report.html"

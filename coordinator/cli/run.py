@@ -15,7 +15,14 @@ from typing import TYPE_CHECKING, Any
 from coordinator.cli import CommandError
 from coordinator.cli.journaling import add_journal_arguments, journal_folder, new_store, tidy
 from coordinator.cli.learning import add_learning_arguments, opened, saved
-from coordinator.cli.loading import add_services_argument, cell_path, load_directory, load_task, write_json
+from coordinator.cli.loading import (
+    add_services_argument,
+    cell_path,
+    load_directory,
+    load_task,
+    pictures_of,
+    write_json,
+)
 
 if TYPE_CHECKING:
     from coordinator.launch import Setting
@@ -324,5 +331,6 @@ def give(
         options.report.mkdir(parents=True, exist_ok=True)
         write_json(str(options.report / "result.json"), result)
         page = options.report / "index.html"
-        page.write_text(report_html(result, timeline, draw(task, error_branches=True)), encoding="utf-8")
+        net = draw(task, error_branches=True)
+        page.write_text(report_html(result, timeline, net, pictures_of(task, result)), encoding="utf-8")
         print(f"report: {page}")

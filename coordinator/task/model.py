@@ -324,6 +324,8 @@ class Task:
     score: str = ""
     """Service that is called at its end and gives the task's own results; empty: none."""
     text: str = ""
+    pictures: str = ""
+    """Import path "module:function" of what draws a mission run's result for its report: SVG by title; empty: nothing."""
     services: str = ""
     """Location file that the task is usually run with, relative to the task's own file; empty: the one at hand."""
 

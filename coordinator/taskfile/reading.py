@@ -91,6 +91,7 @@ def _task(root: Table) -> Task:
         runs_place=head.text("runs_place", ""),
         prepare=head.text("prepare", ""),
         score=head.text("score", ""),
+        pictures=head.text("pictures", ""),
         services=head.text("services", ""),
         parameters=head.plain("parameters"),
         primitive_tasks={n: _primitive_task(n, t) for n, t in root.tables("primitive_tasks").items()},

@@ -18,7 +18,7 @@ _SHORT = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\t": "\\t", "\r": "\\r"}
 def dumps(task: Task) -> str:
     """The task as TOML text."""
     head = {k: getattr(task, k) for k in ("name", "text", "goal", "goal_transitions", "final", "final_error")}
-    head |= {k: getattr(task, k) for k in ("runs_place", "prepare", "score", "services")}
+    head |= {k: getattr(task, k) for k in ("runs_place", "prepare", "score", "pictures", "services")}
     lines = [f"schema = {SCHEMA}", ""]
     lines += _section("task", head)
     if task.parameters:

@@ -200,3 +200,20 @@ def test_a_task_may_name_its_own_location_file(monkeypatch: pytest.MonkeyPatch, 
     assert cell_path(Path("mine.toml"), "follow_track", task) == Path("mine.toml")
     assert cell_path(None, "catch_ball", load(SHIPPED / "catch_ball.toml")) == ROOT / "services.toml"
     assert main(["check", "follow_track"]) == 0
+
+
+def test_a_task_may_draw_its_own_pictures() -> None:
+    """`pictures` of the task file names a function that draws a result for the report; a name that leads nowhere is told."""
+    from dataclasses import replace
+
+    from coordinator.cli import CommandError
+    from coordinator.cli.loading import SHIPPED, pictures_of
+    from coordinator.taskfile import load
+
+    task = load(SHIPPED / "follow_track.toml")
+    assert pictures_of(task, {"task": "follow_track"}) == {}, "nothing was scored"
+    assert pictures_of(load(SHIPPED / "catch_ball.toml"), {}) == {}
+    assert list(pictures_of(replace(task, pictures="builtins:dict"), {"plan": "<svg/>"})) == ["plan"]
+    for wrong in ("nowhere:draw", "coordinator:nothing"):
+        with pytest.raises(CommandError, match="name a function"):
+            pictures_of(replace(task, pictures=wrong), {})
