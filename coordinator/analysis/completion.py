@@ -78,6 +78,10 @@ def _error(chain: Chain, value: Values, x: Values, b: Values) -> float:
     return float(np.max(np.abs(b + _apply(chain, value, x) - x), initial=0.0)) / largest if largest else 0.0
 
 
+LOOK = 16
+"""Jumps between two looks at how much is still to come."""
+
+
 @dataclass(frozen=True)
 class Law:
     """The distribution of the time to completion: after k uniform jumps at `rate` the goal is reached with absorbed[k]."""
@@ -117,7 +121,9 @@ def law(chain: Chain, goal: Mask, *, left: float = 1e-12, steps: int = 2_000_000
     made = Generator.of(ends)
     reached = goal[made.tangible]
     p, absorbed = made.start, [float(made.start[reached].sum())]
-    while whole.probability - absorbed[-1] > left * whole.probability:
+    # what is still to come is weighed by itself: as a difference of sums it would never fall below their rounding
+    ahead = np.where(reached, 0.0, whole.h[made.tangible])
+    while (len(absorbed) - 1) % LOOK or float(np.sum(p * ahead)) > left * whole.probability:
         if len(absorbed) > steps:
             raise ArithmeticError(f"the law of completion needs more than {steps} jumps; simulate instead")
         p = made.matrix @ p
