@@ -41,6 +41,8 @@ LEASE: Final = 0.5
 """s after which following ends in a hold if the action that asked for it has gone silent."""
 SPEED_SHARE: Final = 0.97
 """Share of the drives' greatest speed that is commanded: the rest is theirs to catch up with."""
+LEAST_SHARE: Final = 1e-3
+"""Slower than this share of its speed no arm moves on purpose."""
 IN_PLACE: Final = 0.003
 """rad by which the measured joints may differ from the pose that a move is said to have reached."""
 NEAR_PLACE: Final = 0.02
@@ -351,8 +353,8 @@ _STANDING: Final = 0.01
 
 
 def _share(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value <= 1.0:
-        raise ValueError(f"speed = {value!r}: must be above 0 and at most 1")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not LEAST_SHARE <= value <= 1.0:
+        raise ValueError(f"speed = {value!r}: must be at least {LEAST_SHARE:g} and at most 1")
     return float(value)
 
 

@@ -25,6 +25,12 @@ STREAM_LENGTH: Final = 9
 """Values of a set point of `catch_point`: time_to_go, x, y, z, vx, vy, vz, sigma_y, sigma_t."""
 
 
+LARGEST: Final = 1000.0
+"""s, m or m/s beyond which a number is no catch point of any laboratory (nor is one that is not finite)."""
+SLOWEST: Final = 1e-3
+"""m/s towards the arm, below which a ball does not come."""
+
+
 @dataclass(frozen=True, slots=True)
 class Prediction:
     """Where (m), when (s from now) and how fast (m/s) the ball's centre leaves the table's near edge; base frame."""
@@ -38,11 +44,13 @@ class Prediction:
     @classmethod
     def parse(cls, values: Sequence[float], age: float = 0.0) -> Prediction:
         """A set point that arrived `age` seconds ago. Raises ValueError if it is none, or moves away from the arm."""
-        if len(values) != STREAM_LENGTH or not all(map(math.isfinite, values)):
-            raise ValueError(f"a catch point has {STREAM_LENGTH} finite numbers, not {list(values)}")
+        if len(values) != STREAM_LENGTH or not all(abs(value) <= LARGEST for value in values):
+            raise ValueError(f"a catch point has {STREAM_LENGTH} numbers of at most {LARGEST:g}, not {list(values)}")
         go, x, y, z, vx, vy, vz, sigma_y, sigma_t = (float(value) for value in values)
-        if vx >= 0.0 or sigma_y < 0.0 or sigma_t < 0.0:
-            raise ValueError(f"a catch point has vx < 0 and sigmas >= 0, not vx = {vx}, sigmas {sigma_y}, {sigma_t}")
+        if vx > -SLOWEST or sigma_y < 0.0 or sigma_t < 0.0:
+            raise ValueError(
+                f"a catch point has vx <= -{SLOWEST:g} m/s and sigmas >= 0, not vx = {vx}, sigmas {sigma_y}, {sigma_t}"
+            )
         return cls(go - age, (x, y, z), (vx, vy, vz), sigma_y, sigma_t)
 
     def shrunk(self, spread: float) -> Prediction:

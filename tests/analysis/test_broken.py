@@ -17,7 +17,12 @@ from coordinator.taskfile import dumps, load
 from tests.analysis.broken import TASKS, VARIANTS, judged
 
 SHIPPED = sorted(TASKS.glob("*.toml"))
-EXPECTED = {"missing_recovery": "deadlock_free", "double_resource": "one_run_each", "leaking_token": "one_run_each"}
+EXPECTED = {
+    "missing_recovery": {"deadlock_free"},
+    "double_resource": {"one_run_each", "deadlock_free"},
+    "leaking_token": {"one_run_each", "deadlock_free"},
+}
+"""What is refused of each at least in part: two runs at once, or an end that never comes."""
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
@@ -39,12 +44,13 @@ def test_broken_variants_are_caught(path: Path, kind: str, tmp_path: Path) -> No
     found = judged(task)
     assert not found.ok
     bad = dict(refused(found))
-    verdict = bad[EXPECTED[kind]]
+    name = next(name for name in bad if name in EXPECTED[kind])
+    verdict = bad[name]
     assert verdict.witness is not None
     *_, last = task.net.replay(verdict.witness.firings) if verdict.witness.firings else (task.net.initial,)
     assert {p: n for p, n in zip(task.net.places, last, strict=True) if n} == verdict.witness.marking
     made = {p.stem: p for p in draw_witnesses(found, task, tmp_path)}
-    root = ElementTree.fromstring(made[f"{task.name}-{EXPECTED[kind]}"].read_text(encoding="utf-8"))
+    root = ElementTree.fromstring(made[f"{task.name}-{name}"].read_text(encoding="utf-8"))
     texts = [e.text or "" for e in root.iter() if e.get("class") == "turn"]
     turns = sorted(int(turn) for text in texts for turn in text.replace("…", "").split(",") if turn.strip())
     assert turns and turns[-1] == len(verdict.witness.firings)

@@ -104,8 +104,8 @@ def test_speed_is_a_share(rig: Any) -> None:
         ({"do": "move", "pose": [0.0] * 5 + [math.nan]}, "a pose is a name or 6 angles"),
         ({"do": "move", "pose": [9.0] + [0.0] * 5}, "joint 1 beyond its limit"),
         ({"do": "move", "pose": [0.33, 0.52, -3.3, 0.12, 0.85, 0.06]}, "cup at the table"),
-        ({"do": "move", "pose": "home", "speed": 0.0}, "must be above 0"),
-        ({"do": "move", "pose": "home", "speed": True}, "must be above 0"),
+        ({"do": "move", "pose": "home", "speed": 0.0}, "must be at least 0.001"),
+        ({"do": "move", "pose": "home", "speed": True}, "must be at least 0.001"),
         ({"do": "follow", "strategy": "net"}, "unknown strategy 'net': know tilted, upright"),
     ],
 )
