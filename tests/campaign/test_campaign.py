@@ -15,6 +15,7 @@ from coordinator.campaign.pool import LocalPool
 from coordinator.campaign.table import TABLE, read_table
 from coordinator.launch import Setting, lockstep_cell
 from tests.campaign.conftest import Conduct
+from tests.waiting import beat
 
 
 def table(folder: Path) -> bytes:
@@ -151,7 +152,7 @@ def test_workers_in_any_number_and_a_killed_one_change_nothing(
             going = asyncio.create_task(campaign.run(pool))
             if kill:
                 while not pool.pids:
-                    await asyncio.sleep(0)
+                    await beat(0)
                 os.kill(pool.pids[0], signal.SIGKILL)
             await going
             return pool

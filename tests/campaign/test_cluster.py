@@ -18,6 +18,7 @@ from coordinator.campaign.conduct import Campaign, Progress
 from coordinator.campaign.plan import CampaignError, Plan
 from coordinator.campaign.table import TABLE
 from tests.campaign.conftest import HERE, Conduct
+from tests.waiting import beat
 
 ROOT = HERE.parents[1]
 PATIENCE = 60.0
@@ -72,7 +73,7 @@ async def _conducted(folder: Path, plan: Plan, where: Path, victim: subprocess.P
     loop = asyncio.get_running_loop()
     until = loop.time() + PATIENCE
     while not where.exists() and loop.time() < until:
-        await asyncio.sleep(0)
+        await beat(0)
     address = json.loads(where.read_text(encoding="utf-8"))["address"]
 
     def watch(progress: Progress) -> None:

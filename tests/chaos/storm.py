@@ -36,6 +36,7 @@ from coordinator.supervisor import Supervisor
 from coordinator.task import Status
 from services.comm.directory import Directory, load
 from tests.chaos.shuttle_cell import ROOT, TASK, free_ports, moves, shuttle_services
+from tests.waiting import beat
 
 MARK = "PETROBOT_STORM"
 """Environment variable that all processes of a storm carry."""
@@ -76,7 +77,7 @@ class Weather:
         """Break something every now and then, until cancelled."""
         try:
             while True:
-                await asyncio.sleep(float(self._draw.exponential(0.35)))
+                await beat(float(self._draw.exponential(0.35)))
                 kind = str(self._draw.choice(self._kinds))
                 self.seen[kind] += 1
                 await getattr(self, f"_{kind}")()
@@ -99,7 +100,7 @@ class Weather:
     async def _freeze(self, process: int) -> None:
         self._frozen.add(process)
         _signal(process, signal.SIGSTOP)
-        await asyncio.sleep(float(self._draw.uniform(0.05, 2.0)))
+        await beat(float(self._draw.uniform(0.05, 2.0)))
         _signal(process, signal.SIGCONT)
         self._frozen.discard(process)
 
@@ -117,7 +118,7 @@ class Weather:
 
     async def _lo_down(self) -> None:
         _link("down")
-        await asyncio.sleep(float(self._draw.uniform(0.1, 2.0)))
+        await beat(float(self._draw.uniform(0.1, 2.0)))
         _link("up")
 
     async def _order(self, line: str) -> None:
@@ -203,7 +204,7 @@ class Storm:
         while loop.time() < end:
             if len(supervisor.process_ids()) == len(NODES) and await self._mission(loop.time(), CALM):
                 return
-            await asyncio.sleep(0.2)
+            await beat(0.2)
         self._faults.append("no calm mission run without error came about")
 
     async def _mission(self, now: float, name: str = "") -> bool:

@@ -14,6 +14,7 @@ from services.comm.server import Server
 from services.device import Ports
 from services.node import Node
 from services.place import InlinePlace
+from tests.waiting import beat
 
 SERVICES = """\
 schema = 1
@@ -194,7 +195,7 @@ class RobotNode:
         while True:
             self.node.advance(self.server.now())
             self.server.flush()
-            await asyncio.sleep(0.004)
+            await beat(0.004)
 
     async def close(self) -> None:
         """Leave."""

@@ -24,6 +24,7 @@ from coordinator.realtime import RealtimeMission
 from coordinator.runfolder import JOURNAL
 from coordinator.taskfile import loads
 from tests.cli.cell import TASK, Arm, RobotNode, directory_in
+from tests.waiting import beat
 
 RUN = "reaching-1"
 
@@ -79,7 +80,7 @@ class Terminal:
         """Wait until something holds."""
         async with asyncio.timeout(timeout):
             while not holds():
-                await asyncio.sleep(0.002)
+                await beat(0.002)
 
     async def working(self, *options: str) -> None:
         """Lead the run to where the arm reaches."""

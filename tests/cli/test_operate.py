@@ -15,6 +15,7 @@ from coordinator.engine import Mode
 from coordinator.hmi import house
 from coordinator.runfolder import JOURNAL, NoRunError
 from tests.cli.conftest import RUN, Terminal
+from tests.waiting import beat
 
 STEERING = [command.name for command in COMMANDS if command.module.startswith("operate.")]
 
@@ -193,7 +194,7 @@ async def test_controls_of_a_script_go_free(petrobot: Terminal, monkeypatch: pyt
             assert (await answer.json())["ok"]
     async with asyncio.timeout(20):
         while (await petrobot("pause", "--as", "ana")).code != 0:
-            await asyncio.sleep(0.01)
+            await beat(0.01)
 
 
 async def test_watch_tells_what_happens_until_the_end(petrobot: Terminal) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from coordinator.supervisor import LaunchError, Program, Supervisor
+from tests.waiting import beat
 
 pytestmark = pytest.mark.processes
 STEADY = "print('ready', flush=True); import signal; signal.pause()"
@@ -37,7 +38,7 @@ async def until_said(said: list[str], count: int) -> None:
     """Wait for so many notices."""
     async with asyncio.timeout(60.0):
         while len(said) < count:
-            await asyncio.sleep(0.01)
+            await beat(0.01)
 
 
 async def test_a_killed_program_is_started_again_and_all_end_with_the_supervisor(tmp_path: Path) -> None:
@@ -48,7 +49,7 @@ async def test_a_killed_program_is_started_again_and_all_end_with_the_supervisor
         await until_said(said, 1)
         async with asyncio.timeout(60.0):
             while keeper.process_ids().get("a", before["a"]) == before["a"]:
-                await asyncio.sleep(0.01)
+                await beat(0.01)
         assert (keeper.starts("a"), keeper.starts("b")) == (2, 1)
         assert keeper.process_ids()["b"] == before["b"]
         last = list(keeper.process_ids().values())

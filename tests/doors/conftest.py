@@ -23,6 +23,7 @@ from services.comm.client import Client
 from services.comm.codec import decode, encode
 from services.comm.credentials import Credentials
 from services.comm.wire import Connection, Side
+from tests.waiting import beat
 
 KEY = bytes(range(32))
 HELLO = m.Hello(1, 1, "coordinator", "coord", "c1", 3)
@@ -115,7 +116,7 @@ class GoodClient:
             outcome = await self.client.call("echo", {"n": self.served})
             assert (outcome.status, outcome.values) == ("success", {"n": self.served}), outcome
             self.served += 1
-            await asyncio.sleep(0.001)
+            await beat(0.001)
 
     async def still_served(self, more: int = 20) -> None:
         """Wait until it has been served some more; raises what it met with meanwhile."""
@@ -125,7 +126,7 @@ class GoodClient:
             while self.served < wanted:
                 if self._task.done():
                     self._task.result()
-                await asyncio.sleep(0.002)
+                await beat(0.002)
 
     async def end(self) -> None:
         """Leave."""

@@ -23,6 +23,7 @@ from hypothesis import strategies as st
 from services.comm import messages as m
 from services.comm.wire import Connection, ProtocolError, Side
 from tests.doors.conftest import HELLO, KEY, MIB, GoodClient, Stranger, Victim, frame
+from tests.waiting import beat
 
 pytestmark = pytest.mark.processes
 Start = Callable[..., Victim]
@@ -240,7 +241,7 @@ async def test_slow_loris(victim: Start, keyed: bool) -> None:
         stranger = await Stranger.at(server)
         for byte in hello:
             await stranger.say(bytes([byte]))
-            await asyncio.sleep(0.05)
+            await beat(0.05)
             if stranger.writer.is_closing() or stranger.reader.at_eof():
                 break
         assert stranger.reader.at_eof() or stranger.writer.is_closing() or await stranger.refused() == ""

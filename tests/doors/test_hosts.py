@@ -25,6 +25,7 @@ from services.comm.directory import parse
 from services.comm.security import new_key, write_key
 from tests.doors.arm_cell import ROOT, cell_in
 from tests.doors.conftest import KEY, Victim
+from tests.waiting import beat
 
 pytestmark = pytest.mark.processes
 Start = Callable[..., Victim]
@@ -213,7 +214,7 @@ async def test_a_guarded_cell_works_and_keeps_its_secrets(tmp_path: Path, how: s
         while not done.done() and not token:
             for path in tmp_path.glob(f"runs/*/{DOOR}"):
                 token["page token"] = json.loads(path.read_text())["token"]
-            await asyncio.sleep(0.01)
+            await beat(0.01)
 
     async with Supervisor(local_programs(cell.directory), tmp_path / "logs", respawn=False, notice=cell.said.append):
         options = ("--journal", "runs", "--report", "report", "--json", "out.json", "--no-page")

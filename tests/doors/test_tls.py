@@ -21,6 +21,7 @@ from services.comm.credentials import Credentials, may_speak_as
 from services.comm.directory import DirectoryError, parse
 from services.comm.security import KeyFileError
 from tests.doors.conftest import HELLO, Victim
+from tests.waiting import beat
 
 ROOT = Path(__file__).parents[2]
 Start = Callable[..., Victim]
@@ -225,7 +226,7 @@ async def test_client_tells_why_it_is_lost(victim: Start, certificates: Path, tm
     client.start()
     async with asyncio.timeout(20.0):
         while "our certificate is not trusted" not in client.trouble:
-            await asyncio.sleep(0.005)
+            await beat(0.005)
     await client.close()
 
 

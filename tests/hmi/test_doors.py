@@ -20,6 +20,7 @@ from coordinator.hmi.port import PROTOCOL
 from coordinator.hmi.server import Page, start_page
 from coordinator.hmi.sessions import LARGEST_MESSAGE
 from tests.hmi.stage import Stage
+from tests.waiting import beat
 
 EVIL = "http://evil.example"
 
@@ -190,7 +191,7 @@ async def test_a_thousand_sockets_do_not_keep_the_operator_out(page: Page) -> No
                 crowd.append(socket.socket())
                 crowd[-1].setblocking(False)
                 crowd[-1].connect_ex(("127.0.0.1", port_of(page)))
-                await asyncio.sleep(0)
+                await beat(0)
             async with http.post(base(page) + "/api/command", json={"verb": "estop", "name": "ana"}) as answer:
                 assert answer.status == 200
             assert page.gate.turned_away >= 1_000 - CONNECTIONS

@@ -15,6 +15,7 @@ from coordinator.supervisor import Supervisor
 from coordinator.task import Executed, Status
 from services.comm.directory import Directory, load
 from tests.chaos.shuttle_cell import TASK, moves, shuttle_services
+from tests.waiting import beat
 
 pytestmark = pytest.mark.processes
 LIMIT = 120.0
@@ -42,7 +43,7 @@ async def until_moving(folder: Path) -> None:
     """Until a move has begun."""
     async with asyncio.timeout(LIMIT):
         while not moves(folder, "begin"):
-            await asyncio.sleep(0.005)
+            await beat(0.005)
 
 
 async def test_the_second_coordinator_is_refused_until_the_first_has_gone(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from services.comm.server import Server
 from services.node import GENERAL, Node
 from services.place import InlinePlace
 from services.scripted import load
+from tests.waiting import beat
 
 SERVICES = """\
 schema = 1
@@ -129,7 +130,7 @@ class ToyNode:
         while True:
             self.node.advance(self.server.now())
             self.server.flush()
-            await asyncio.sleep(0.004)
+            await beat(0.004)
 
     async def close(self) -> None:
         """Leave."""
@@ -167,7 +168,7 @@ class Cell:
         """Wait until something holds."""
         async with asyncio.timeout(timeout):
             while not holds():
-                await asyncio.sleep(0.002)
+                await beat(0.002)
 
     async def ended(self) -> Mapping[str, Any]:
         """Wait for the run's end; its result."""
