@@ -274,9 +274,22 @@ class Arm:
 
     def _advance(self) -> None:
         self._commanded.append(self._trajectory.q)
+        late = self._ports.now  # receiving and planning took time: what counts is the clock at the last moment
+        if self._follows() and not self._follower.fresh(late):
+            self._let_go()
         self._steering.cycle(self._paused)
-        if self._mode == "follow" and self._steering.goal is not None and not self._paused:
-            self._follower.executed(self._ports.now)
+        if self._follows():
+            self._follower.executed(late)
+
+    def _follows(self) -> bool:
+        """Whether this cycle goes towards a set point."""
+        return self._mode == "follow" and self._steering.goal is not None and not self._paused
+
+    def _let_go(self) -> None:
+        """The last set point is stale: come to rest, and take its values for new ones if they come again."""
+        self._steering.rest()
+        self._follower.drop()
+        self._reason = "no_setpoint"
 
     def _follow_on(self, now: float) -> None:
         """Aim at the newest prediction, or hold where it is stale or the action silent."""
@@ -285,11 +298,8 @@ class Arm:
             self._rest("silent_action")
             return
         if not follower.take(self._setpoint, now):
-            if follower.fresh(now):
-                return
-            self._steering.rest()
-            follower.drop()
-            self._reason = "no_setpoint"
+            if not follower.fresh(now):
+                self._let_go()
             return
         plan = follower.plan_with(self._interceptor, trajectory, self._speeds(), self._full_acceleration, now)
         self._reason = "" if plan is not None else "unreachable"

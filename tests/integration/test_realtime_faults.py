@@ -27,8 +27,6 @@ pytestmark = pytest.mark.processes
 LIMIT = 120.0
 PERIODS = 3
 """Of the stream, after which the arm must hold."""
-LOOKS, CYCLE = 2, 0.004
-"""Cycles of the servo (s) that may pass until it is seen, on a host that was late itself."""
 
 
 class When:
@@ -95,7 +93,7 @@ async def test_a_node_killed_in_mid_catch_is_an_error_and_the_task_goes_on(
     tmp_path: Path, place: str, node: str
 ) -> None:
     """kill -9: its run ends in ERROR with executed = unknown and a reason, the node is started again, final is reached.
-    Whatever befalls the sender, no set point older than three periods and two cycles is executed."""
+    Whatever befalls the sender, no set point older than three periods is executed."""
     mission, runs, supervisor, arm = await run_and_kill(tmp_path, place, node)
     finished = mission.executor.finished
     assert finished is not None
@@ -107,8 +105,8 @@ async def test_a_node_killed_in_mid_catch_is_an_error_and_the_task_goes_on(
     assert len(mission.tally.cycles) == 2 or finished.status is Status.ERROR
     assert all(r.cause for r in runs if r.status is Status.ERROR)
     stream = mission.executor.directory.streams["catch_point"]
-    assert arm["stale_executed"] <= LOOKS
-    assert arm["oldest_executed"] <= PERIODS * stream.period + LOOKS * CYCLE
+    assert arm["stale_executed"] == 0
+    assert arm["oldest_executed"] <= PERIODS * stream.period
     assert node == "motion" or arm["setpoint_count"] > 0, "a motion node that was killed counts anew"
 
 

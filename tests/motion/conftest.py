@@ -144,12 +144,14 @@ class Rig:
         self.drives = drives if drives is not None else DriveBus(self.plant, ratings(TABLE))
         self.commanded: list[list[float]] = []
         self.on_step: Callable[[float], None] | None = None
+        self.thinking = 0.0
+        """s by which the clock is ahead of the cycle's beginning: what a real host's cycle takes."""
         self.arm = Arm(config or {}, self)
         self.sync = True
 
     @property
     def now(self) -> float:
-        return self.cycle * PERIOD
+        return self.cycle * PERIOD + self.thinking
 
     def can(self) -> Wire:
         return self.wire
@@ -170,7 +172,7 @@ class Rig:
     def tick(self, arm_lives: bool = True) -> None:
         """One cycle of arm, bus, drives and plant."""
         if arm_lives:
-            self.arm.step(self.now)
+            self.arm.step(self.cycle * PERIOD)
             self.commanded.append(list(self.arm.state()["commanded"]))
         if self.drives is not None:
             self._laboratory()

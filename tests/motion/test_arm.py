@@ -145,6 +145,17 @@ def test_following_brings_the_cup_to_the_predicted_point(rig: Any) -> None:
     _check_limits(rig)
 
 
+@pytest.mark.parametrize("thinking", [0.001, 0.003, 0.011, 0.050])
+def test_a_cycle_that_takes_long_executes_nothing_stale(rig: Any, thinking: float) -> None:
+    """What is fresh when a cycle begins may be stale when its target leaves: the clock at the last moment decides."""
+    _follow(rig, 0.12, y=0.3)
+    rig.thinking = thinking
+    assert rig.run(0.1, lambda: rig.arm.state()["reason"] == "no_setpoint")
+    state = rig.arm.state()
+    assert state["stale_executed"] == 0
+    assert state["oldest_executed"] <= 3 * STREAM_PERIOD + 1e-9
+
+
 def test_it_holds_within_three_periods_of_the_stream(rig: Any) -> None:
     _follow(rig, 0.12, y=0.3)
     assert not rig.arm.state()["still"]
