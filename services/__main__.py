@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import os
-import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from services.comm.directory import COORDINATOR, Directory, DirectoryError, parse, verify_imports
+from services.comm.directory import Directory, DirectoryError, parse, verify_imports
 from services.comm.directory_file import nearest
-from services.comm.lockstep import CellError, Delays, Member
-from services.comm.security import KeyFileError, KeyNeededError, read_key
+from services.comm.lockstep import CellError
+from services.comm.lockstep_process import run_member
+from services.comm.security import KeyFileError, KeyNeededError
 from services.lockstep_node import LockstepNode
 from services.scripted import ScriptError
 from services.scripted import load as load_script
@@ -61,33 +60,6 @@ def read(path: Path, name: str) -> tuple[Directory, str]:
     return directory, text
 
 
-def run_lockstep(directory: Directory, name: str, mock: str, awaited: float) -> None:
-    """Be a member of a lock-step cell of one process a node, until one of them ends it.
-
-    `awaited`: seconds (wall time) that a coordinator which died may take to come back; 0: it is not waited for.
-    """
-    node = LockstepNode(directory, name, substitutes=load_script(mock) if mock else None)
-    key = read_key(directory.file(directory.keys["file"])) if "file" in directory.keys else None
-    delays = Delays(directory.delays())
-    member = Member(
-        name,
-        [node],
-        directory.members(),
-        delays=delays,
-        directory=directory.hash,
-        key=key,
-        returning={COORDINATOR} if awaited else (),
-        absence=awaited,
-    )
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
-    print(f"node {name} ready for lock step, process {os.getpid()}", flush=True)
-    try:
-        member.open()
-        member.run()
-    finally:
-        node.close()
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the node; gives the exit code."""
     options = parser().parse_args(arguments)
@@ -96,7 +68,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.mock:
             load_script(options.mock)
         if options.lockstep:
-            run_lockstep(directory, options.name, options.mock, options.await_coordinator)
+            substitutes = load_script(options.mock) if options.mock else None
+            party = LockstepNode(directory, options.name, substitutes=substitutes)
+            run_member(directory, options.name, party, options.await_coordinator)
         else:
             memory = directory.nodes[options.name].worker_memory_mb << 20
             asyncio.run(serve(directory, options.name, text, mock=options.mock, memory=memory))

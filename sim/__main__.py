@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import os
-import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from services.comm.directory import COORDINATOR, Directory, DirectoryError, load, resolve
-from services.comm.lockstep import CellError, Delays, Member
-from services.comm.security import KeyFileError, KeyNeededError, read_key
+from services.comm.directory import Directory, DirectoryError, load, resolve
+from services.comm.lockstep import CellError
+from services.comm.lockstep_process import run_member
+from services.comm.security import KeyFileError, KeyNeededError
 from sim.realtime import serve
 from sim.truth import LaboratoryError
 
@@ -52,40 +51,14 @@ def read(path: Path) -> tuple[Directory, str]:
     return directory, name
 
 
-def run_lockstep(directory: Directory, name: str, awaited: float) -> None:
-    """Be a member of a lock-step cell of one process a node, until one of them ends it.
-
-    `awaited`: seconds (wall time) that a coordinator which died may take to come back; 0: it is not waited for.
-    """
-    laboratory = resolve(directory.nodes[name].sim)(directory, name)
-    key = read_key(directory.file(directory.keys["file"])) if "file" in directory.keys else None
-    delays = Delays(directory.delays())
-    member = Member(
-        name,
-        [laboratory],
-        directory.members(),
-        delays=delays,
-        directory=directory.hash,
-        key=key,
-        returning={COORDINATOR} if awaited else (),
-        absence=awaited,
-    )
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
-    print(f"node {name} ready for lock step, process {os.getpid()}", flush=True)
-    try:
-        member.open()
-        member.run()
-    finally:
-        laboratory.close()
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the laboratory; gives the exit code."""
     options = parser().parse_args(arguments)
     try:
         directory, name = read(options.services)
         if options.lockstep:
-            run_lockstep(directory, name, options.await_coordinator)
+            laboratory = resolve(directory.nodes[name].sim)(directory, name)
+            run_member(directory, name, laboratory, options.await_coordinator)
         else:
             asyncio.run(serve(directory, name))
     except (DirectoryError, LaboratoryError, KeyNeededError, KeyFileError, ImportError, ValueError, OSError) as fault:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import csv
 import json
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import islice
@@ -27,12 +26,10 @@ from coordinator.campaign.plan import (
 )
 from coordinator.campaign.policies import Policy, policy_of
 from coordinator.campaign.rows import Row, rows_of
+from coordinator.campaign.spent import note_block, note_sessions, sessions
+from coordinator.campaign.summary import Summary, result_of
 from coordinator.campaign.table import TABLE, Table
 
-TIMES = "times.csv"
-TIME_COLUMNS = ("block", "worker", "cpu_s", "wall_s", "mission_s", "rss_mb")
-SESSIONS = "sessions.csv"
-SESSION_COLUMNS = ("began_at", "workers", "wall_s", "blocks", "lost")
 AHEAD = 3
 """Blocks handed out beyond those that the workers are busy with, so that none waits while a slow one is awaited."""
 
@@ -106,7 +103,7 @@ class Campaign:
         done = self.table.recover(blocks)
         if done == len(blocks) and not self.policy.learns:
             return
-        self._sessions = read_csv(self.folder / SESSIONS)
+        self._sessions = sessions(self.folder)
         self._session = {
             "began_at": datetime.now(UTC).isoformat(timespec="seconds"),
             "workers": pool.count,
@@ -132,8 +129,6 @@ class Campaign:
 
     def result(self) -> dict[str, Any]:
         """The result so far, as the command line writes it; the estimates file is written beside the table."""
-        from coordinator.campaign.summary import Summary, result_of
-
         name = identity(self.plan)
         summary = Summary.of(self.bench.task, self.table.rows(), name)
         write_estimates(self.folder, summary.estimates, self.policy.selectors(), f"campaign/{name}")
@@ -168,7 +163,7 @@ class Campaign:
         plots = self.folder / f"{PLOTS}.json"
         if result[PLOTS] and not plots.exists():
             plots.write_text(json.dumps(result[PLOTS], indent=2) + "\n", encoding="utf-8")
-        _append(self.folder / TIMES, TIME_COLUMNS, [_times(block, result)])
+        note_block(self.folder, block, result)
         self._note_session(pool)
         self.table.append(rows)
         self._throws += len(rows)
@@ -182,35 +177,4 @@ class Campaign:
         """Write down this session so far, so that one that is killed is known, too."""
         self._session["blocks"] += 1
         self._session |= {"wall_s": round(time.monotonic() - self._began, 3), "lost": pool.lost}
-        temporary = self.folder / f"{SESSIONS}.new"
-        temporary.unlink(missing_ok=True)
-        rows = [*self._sessions, self._session]
-        _append(temporary, SESSION_COLUMNS, [[row[name] for name in SESSION_COLUMNS] for row in rows])
-        temporary.replace(self.folder / SESSIONS)
-
-
-def _times(block: Block, result: Mapping[str, Any]) -> list[Any]:
-    return [block.index, result["pid"], result["cpu_s"], result["wall_s"], result["mission_s"], result["rss_mb"]]
-
-
-def _append(path: Path, names: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    new = not path.exists()
-    with path.open("a", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        if new:
-            writer.writerow(names)
-        writer.writerows(rows)
-
-
-def read_csv(path: Path) -> list[dict[str, str]]:
-    """The records of a small CSV file; none if it does not exist."""
-    if not path.exists():
-        return []
-    with path.open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def began(folder: Path) -> str | None:
-    """When a campaign's first session began (UTC, ISO 8601); None if it is not known."""
-    sessions = read_csv(folder / SESSIONS)
-    return sessions[0]["began_at"] if sessions else None
+        note_sessions(self.folder, [*self._sessions, self._session])

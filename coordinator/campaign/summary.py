@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from coordinator.campaign.conduct import SESSIONS, TIMES, read_csv
 from coordinator.campaign.observed import ESTIMATES, add_row, context_of
 from coordinator.campaign.plan import Plan
 from coordinator.campaign.rows import Row
+from coordinator.campaign.spent import sessions, times
 from coordinator.campaign.table import TABLE
 from coordinator.learning.estimate import Key, Tally
 from coordinator.learning.intervals import wilson
@@ -133,24 +133,24 @@ class Summary:
 def result_of(folder: Path, plan: Plan, made: Summary, policy: Mapping[str, Any]) -> dict[str, Any]:
     """The result of a campaign as the command line writes it."""
     summary, task = made.to_plain(), made.task
-    sessions, times = read_csv(folder / SESSIONS), read_csv(folder / TIMES)
-    wall = sum(float(s["wall_s"]) for s in sessions)
-    core_s = sum(float(s["wall_s"]) * int(s["workers"]) for s in sessions)
-    cpu = sum({int(t["block"]): float(t["cpu_s"]) for t in times}.values())
+    held, took = sessions(folder), times(folder)
+    wall = sum(float(s["wall_s"]) for s in held)
+    core_s = sum(float(s["wall_s"]) * int(s["workers"]) for s in held)
+    cpu = sum({int(t["block"]): float(t["cpu_s"]) for t in took}.values())
     sim = summary["sim_s"]
     return {
         "task": task.name,
         "regimes": list(plan.regimes),
         "seed": plan.seed,
         "selector": plan.selector,
-        "workers": int(sessions[-1]["workers"]) if sessions else 0,
+        "workers": int(held[-1]["workers"]) if held else 0,
         "rows": str(folder / TABLE),
         "estimates": str(folder / ESTIMATES),
         **summary,
         "runs": plan.runs,
         "begun": summary["runs"],
         "policy": dict(policy),
-        "lost_workers": sum(int(s["lost"]) for s in sessions),
+        "lost_workers": sum(int(s["lost"]) for s in held),
         "wall_s": round(wall, 3),
         "cpu_s": round(cpu, 3),
         "times_real_time_per_core": round(sim / core_s, 3) if core_s else None,

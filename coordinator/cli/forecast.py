@@ -149,8 +149,8 @@ def _compare(registered: Path, folder: Path, options: argparse.Namespace) -> int
 
 def compared(registered: Path, folder: Path) -> dict[str, Any]:
     """A registered forecast beside what a campaign measured. Raises CommandError when they do not belong together."""
-    from coordinator.campaign.conduct import began
     from coordinator.campaign.plan import read_manifest
+    from coordinator.campaign.spent import began
     from coordinator.campaign.table import TABLE, read_table
     from coordinator.forecast.agreement import agreement
     from coordinator.forecast.history import by_regime

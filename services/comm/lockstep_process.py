@@ -1,0 +1,46 @@
+"""A process of its own for one party of a lock-step cell: what `python -m services` and `python -m sim` share."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from typing import Protocol
+
+from services.comm.directory import COORDINATOR, Directory
+from services.comm.lockstep import Delays, Member
+from services.comm.party import Party
+from services.comm.security import read_key
+
+
+class Closable(Party, Protocol):
+    """A party that holds something to be given back."""
+
+    def close(self) -> None:
+        """Give back what it holds."""
+
+
+def run_member(directory: Directory, name: str, party: Closable, awaited: float) -> None:
+    """Be the member `name` of a lock-step cell of one process a node, until one of them ends it or SIGTERM comes.
+
+    `awaited`: seconds (wall time) that a coordinator which died may take to come back; 0: it is not waited for.
+    Raises CellError when another member is lost, KeyFileError for a key file that cannot be used.
+    """
+    key = read_key(directory.file(directory.keys["file"])) if "file" in directory.keys else None
+    member = Member(
+        name,
+        [party],
+        directory.members(),
+        delays=Delays(directory.delays()),
+        directory=directory.hash,
+        key=key,
+        returning={COORDINATOR} if awaited else (),
+        absence=awaited,
+    )
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    print(f"node {name} ready for lock step, process {os.getpid()}", flush=True)
+    try:
+        member.open()
+        member.run()
+    finally:
+        party.close()
