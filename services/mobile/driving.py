@@ -136,20 +136,20 @@ async def search_pattern(
 ) -> Result:
     """Recover the track by going into the empty square and looking straight on, to the left and to the right.
 
-    Needs no sensor and no guess, and finds the way back from a wrong guess; takes longest. See `_recover`.
+    Needs no sensor and no guess, and finds the way back from a wrong guess; takes longest. A rover that stands looks around
+    where it is first: the line may be in view. See `_recover`.
     """
     end, gates = _geometry(ctx, line_end)
     drive = _Drive(ctx, "feed_forward", speed, timeout)
     stuck = await drive.start(gates)
     if stuck is not None:
         return stuck
+    ended = await _where_it_stands(drive)
     for ahead, turns in LOOKS:
         place = Pose(*end.floor(ahead, 0.0), end.heading)
-        ended = await _go(drive, place, rate)
+        ended = ended or await _go(drive, place, rate)
         for turn in turns:
-            if ended is not None:
-                return ended
-            ended = await _look(drive, turned(place.heading + turn), rate)
+            ended = ended or await _look(drive, turned(place.heading + turn), rate)
     return ended or failure("no_track", "the track is not where it can resume", recovered=False)
 
 
@@ -245,7 +245,7 @@ async def _go(drive: _Drive, to: Pose, rate: float) -> Result | None:
         return None
     towards = math.atan2(to.y - y, to.x - x)
     if abs(turned(towards - heading)) > 0.3:
-        ended = await _turn(drive, towards, rate)
+        ended = await _turn(drive, towards, rate, look=True) or await _join(drive)
         if ended is not None:
             return ended
         x, y, _ = ctx.device.state["pose"]
@@ -286,12 +286,29 @@ async def _look(drive: _Drive, heading: float, rate: float) -> Result | None:
     if ended is not None:
         return ended
     await ctx.wait(lambda: ctx.device.state["sights"] > 0, LOOK)
-    state = ctx.device.state
+    return await _join(drive)
+
+
+async def _where_it_stands(drive: _Drive) -> Result | None:
+    """Look without a move; drive to the track if it is there. None when it is not, or the rover still rolls."""
+    ctx = drive.ctx
+    if not ctx.device.state["standing"]:
+        return None
+    await ctx.wait(lambda: ctx.device.state["sights"] > 1, LOOK)
+    return await _join(drive)
+
+
+async def _join(drive: _Drive) -> Result | None:
+    """Drive to the track where it was seen to begin; None if it was not seen, or is not there after all."""
+    state = drive.ctx.device.state
     if not state["sights"]:
         return None
-    await _command(ctx, {"do": "plan", "points": paths.join(Pose(*state["pose"]), Pose(*state["entry"]), 0.0)})
+    way = paths.join(Pose(*state["pose"]), Pose(*state["entry"]), 0.0)
+    await _command(drive.ctx, {"do": "plan", "points": way})
     result = await drive.until(_recovered, min(15.0, drive.left()))
-    return None if result.cause == "no_track" else result
+    if result.cause != "no_track":
+        return result
+    return await drive.again()
 
 
 class _Drive:
@@ -301,6 +318,7 @@ class _Drive:
         self.ctx = ctx
         self._follow = {"do": "follow", "law": law, "speed": speed}
         self._until = ctx.now + timeout
+        self._stretch: dict[str, Any] = {"do": "stretch"}
 
     def left(self) -> float:
         """s that the run may still take."""
@@ -308,7 +326,12 @@ class _Drive:
 
     async def start(self, gates: Sequence[Pose], *, look: bool = True) -> Result | None:
         """Begin a new stretch that leads through one of the gates; how the run ends if the driver refuses."""
-        why = await _command(self.ctx, {"do": "stretch", "gates": [tuple(gate) for gate in gates], "look": look})
+        self._stretch |= {"gates": [tuple(gate) for gate in gates], "look": look}
+        return await self.again()
+
+    async def again(self) -> Result | None:
+        """Begin it once more: what was seen of it was something else."""
+        why = await _command(self.ctx, self._stretch)
         return error("refused", why) if why else None
 
     async def rest(self) -> None:

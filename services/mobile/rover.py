@@ -39,8 +39,9 @@ TURNED: Final = 0.02
 END_REACH: Final = 0.45
 """m of line that tell its direction at its end."""
 REGAINED_SIGHTS: Final = 4
-"""Sights of a new stretch, at most so many m ahead and aside and so many rad askew, after which it can be followed."""
-REGAINED_AHEAD: Final = 0.62
+"""Sights of a new stretch after which it can be followed, if it begins so many m ahead (not behind: the rover may have
+turned since), at most so many aside and so many rad askew."""
+REGAINED_AHEAD: Final = (0.2, 0.62)
 REGAINED_ASIDE: Final = 0.25
 REGAINED_TURN: Final = 0.6
 DRIVES_SHARE: Final = 0.95
@@ -104,6 +105,8 @@ class Rover:
         self._listen(now)
         self._measure(now)
         self._look(now)
+        if self._found_again():
+            self._map.settle()
         speeds = self._drive(now)
         try:
             for frame in self._master.advance(now, speeds):
@@ -127,7 +130,7 @@ class Rover:
             "ahead": self._map.ahead(pose),
             "end": None if end is None else int(end[0]),
             "line_end": self._line_end(),
-            "regained": self._regained(),
+            "regained": self._map.regained,
             "on_line": fit is not None,
             "offset": 0.0 if fit is None else fit.y,
             "heading": 0.0 if fit is None else fit.heading,
@@ -331,14 +334,17 @@ class Rover:
         fit = self._map.fit(pose, ahead, END_REACH)
         return None if fit is None else (*place, pose.heading + fit.heading)
 
-    def _regained(self) -> bool:
-        """Whether a new stretch has been seen often and lies well before the rover."""
+    def _found_again(self) -> bool:
+        """Whether a stretch that was looked for has been seen often and lies well before the rover."""
         near = self._map.entry
         if not self._map.gated or self._map.sights < REGAINED_SIGHTS or near is None:
             return False
         x, y = self._odometry.pose.body(near.x, near.y)
-        fit = self._map.fit(self._odometry.pose, max(0.2, x + 0.1))
-        return x < REGAINED_AHEAD and abs(y) < REGAINED_ASIDE and fit is not None and abs(fit.heading) < REGAINED_TURN
+        nearest, farthest = REGAINED_AHEAD
+        if not nearest < x < farthest or abs(y) > REGAINED_ASIDE:
+            return False
+        fit = self._map.fit(self._odometry.pose, x + 0.1)
+        return fit is not None and abs(fit.heading) < REGAINED_TURN
 
     def _standing(self) -> bool:
         return abs(self._measured) < STANDING and abs(self._turning) < 0.02

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.mobile.odometry import Pose
-from services.mobile.paths import passes
+from services.mobile.paths import join, passes
 from services.mobile.sight import End, TrackAhead, TrackEnd
 
 Vector = NDArray[np.float64]
@@ -83,16 +83,22 @@ class TrackMap:
         self._local: tuple[Pose, tuple[Vector, Vector, Vector, int]] | None = None
         self._gates: tuple[Pose, ...] = ()
         self._looks = True
+        self.regained = False
+        """Whether the stretch that `begin` gave gates for has been found; see `settle`."""
 
     def begin(self, gates: Sequence[Pose] = (), *, look: bool = True) -> None:
         """A new stretch begins: what lies behind stays for the axle to pass over, the end of the last one is forgotten.
 
-        With `gates` only a line that leads through one of them is taken for it: others may be in view. Without `look`
-        no sight is taken until the next stretch begins.
+        With `gates` only a line that leads through one of them is taken for it until `settle` is called: others may be in
+        view, also while the rover turns on the spot. Without `look` no sight is taken until the next stretch begins.
         """
         self._ends.clear()
         self.sights, self.refused, self.entry = 0, 0, None
-        self._gates, self._looks = tuple(gates), look
+        self._gates, self._looks, self.regained = tuple(gates), look, False
+
+    def settle(self) -> None:
+        """The stretch has been found and lies before the rover: from now on what goes on with it is taken."""
+        self._gates, self.regained = (), True
 
     @property
     def gated(self) -> bool:
@@ -130,11 +136,14 @@ class TrackMap:
 
     def plan(self, points: Sequence[Sequence[float]]) -> None:
         """Expect the track at these points (m), near to far, instead of those expected before."""
-        self._local = None
-        self._planned = np.array([[x, y, 1.0] for x, y in points], dtype=float).reshape(-1, 3)
+        self._expect(points)
         self._ends.clear()
         if len(self._planned):
             self.tip = (float(self._planned[-1, 0]), float(self._planned[-1, 1]))
+
+    def _expect(self, points: Sequence[Sequence[float]]) -> None:
+        self._planned = np.array([[x, y, 1.0] for x, y in points], dtype=float).reshape(-1, 3)
+        self._local = None
 
     def drop_seen(self) -> None:
         """Forget what was seen, not what is expected."""
@@ -157,8 +166,8 @@ class TrackMap:
         return self._alike >= ALIKE
 
     def _admitted(self, pose: Pose, points: Sequence[tuple[float, float]]) -> bool:
-        """Whether a line may be the new stretch: gates are asked until it has been seen."""
-        if not self._gates or self.sights:
+        """Whether a line may be the new stretch."""
+        if not self._gates:
             return True
         line = [pose.floor(*point) for point in points]
         return any(passes(line, gate, GATE_ASIDE, GATE_TURN) for gate in self._gates)
@@ -166,7 +175,8 @@ class TrackMap:
     def _see_instead_of_plan(self, pose: Pose, points: Sequence[tuple[float, float]]) -> None:
         """What was planned for where the line is now seen is planned no more.
 
-        A line that lies well beside the plan replaces all that was known: a step in the map would look like a bend.
+        A line that lies well beside the plan replaces all that was known, for a step in the map would look like a bend; a
+        smooth way from here to where it begins is planned instead, since it may begin far ahead.
         """
         if not len(self._planned):
             return
@@ -175,7 +185,7 @@ class TrackMap:
         self._local = None
         if planned is not None and abs(planned.y - y) > STEP_ASIDE and not self.sights:
             self.drop_seen()
-            self.drop_plan()
+            self._expect(join(pose, _entry(pose, points), 0.0))
             return
         cos, sin = math.cos(pose.heading), math.sin(pose.heading)
         ahead = (self._planned[:, 0] - pose.x) * cos + (self._planned[:, 1] - pose.y) * sin

@@ -10,6 +10,9 @@ import pytest
 
 from services.comm.cia402 import Fault
 from services.mobile import driving
+from services.mobile.odometry import Pose as Odo
+from services.mobile.odometry import turned
+from services.mobile.paths import arc
 from services.rehearsal import Rehearsal, rehearse
 from tests.mobile.conftest import Floor, Pose
 from tests.mobile.yard import Yard
@@ -140,6 +143,41 @@ def test_a_search_needs_neither_sensor_nor_guess(kind: str) -> None:
     yard, followed = gap_yard(kind, reflector=False)
     result = play(yard, driving.search_pattern, line_end=followed.values["line_end"]).result
     assert result.status == "success" and result.values["recovered"] is True
+
+
+def blindly_on(yard: Yard, end: Odo, ahead: float) -> None:
+    """Drive on straight beyond the line's end without looking, and stand."""
+    yard.rover.command(yard.ports.now, {"do": "stretch", "look": False})
+    yard.rover.command(yard.ports.now, {"do": "plan", "points": arc(end, 0.0, ahead)})
+    for _ in range(25):
+        yard.rover.command(yard.ports.now, {"do": "follow", "speed": 0.5})
+        yard.run(0.2)
+    assert yard.body.standing and yard.rover.state()["sights"] == 0
+
+
+def test_a_rover_that_stands_beyond_the_gap_goes_on_and_not_back() -> None:
+    """It stands where a first attempt has ended: nearer to where the track resumes than where a search goes to look."""
+    yard, followed = gap_yard("s", reflector=False)
+    line_end = Odo(*followed.values["line_end"])
+    blindly_on(yard, line_end, 1.3)
+    stood = yard.rover.state()["pose"]
+    result = play(yard, driving.search_pattern, line_end=list(line_end)).result
+    x, y, heading = yard.rover.state()["pose"]
+    assert result.status == "success" and Odo(*stood).body(x, y)[0] > 0.05 and abs(turned(heading - stood[2])) < 0.3
+
+
+def test_a_line_seen_in_passing_is_not_regained_by_turning_away_from_it() -> None:
+    """The sights of a turn on the spot make nobody follow what then lies behind."""
+    yard, followed = gap_yard("s", reflector=False)
+    end = Odo(*followed.values["line_end"])
+    blindly_on(yard, end, 1.0)
+    yard.rover.command(yard.ports.now, {"do": "stretch", "gates": [tuple(Odo(*end.floor(2.0, 0.0), end.heading))]})
+    yard.run(0.3)
+    assert yard.rover.state()["sights"] > 3 and not yard.rover.state()["regained"]
+    for _ in range(20):
+        yard.rover.command(yard.ports.now, {"do": "turn", "to": end.heading + math.pi})
+        yard.run(0.2)
+        assert not yard.rover.state()["regained"]
 
 
 def test_a_search_where_nothing_is_gives_up() -> None:

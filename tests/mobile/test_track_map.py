@@ -113,12 +113,17 @@ def test_a_plan_stands_in_until_the_line_is_seen() -> None:
     assert seen is not None and seen.y == pytest.approx(0.03, abs=1e-6), "the plan is dropped where the line is seen"
 
 
-def test_a_line_well_beside_the_plan_replaces_it() -> None:
+def test_a_line_well_beside_the_plan_replaces_it_by_a_smooth_way() -> None:
     track = TrackMap()
-    track.plan(arc(Pose(0, 0, 0), 0.0, 2.0))
-    pose = Pose(0.5, 0, 0)
-    assert track.take(pose, sight(pose, Pose(0, 0.2, 0)))
-    assert track.fit(pose, 0.0) is None, "no step from the plan to the line, which would look like a bend"
+    track.plan(arc(Pose(0, 0, 0), 0.0, 3.0))
+    pose, line = Pose(0.5, 0, 0), Pose(0, 0.15, 0)
+    far = TrackAhead(0.0, 1.0, None, tuple((x, y) for x, y in sight(pose, line).points if x > 0.8))
+    assert track.take(pose, far)
+    here, there = track.fit(pose, 0.0), track.fit(pose, 1.0)
+    assert here is not None and abs(here.y) < 0.01 and abs(here.heading) < 0.1, "it begins where the rover is"
+    assert there is not None and there.y == pytest.approx(0.15, abs=0.005), "it ends on the line"
+    bends = [fit.curvature for i in range(11) if (fit := track.fit(pose, 0.1 * i)) is not None]
+    assert len(bends) == 11 and max(map(abs, bends)) < 2.0, "no step, which would look like a bend"
 
 
 def test_only_a_line_through_a_gate_begins_a_gated_stretch() -> None:
@@ -128,6 +133,19 @@ def test_only_a_line_through_a_gate_begins_a_gated_stretch() -> None:
     assert not track.take(pose, sight(pose, Pose(2.0, 0.45, 0.0))) and track.sights == 0
     assert track.take(pose, sight(pose, Pose(2.0, 0.1, 0.1))) and track.sights == 1 and track.entry is not None
     assert track.entry.heading == pytest.approx(0.1, abs=1e-6)
+
+
+def test_gates_are_asked_until_the_stretch_has_been_found() -> None:
+    track, pose, behind = TrackMap(), Pose(1.2, 0, 0), Pose(1.2, 0, math.pi)
+    track.begin([Pose(2.0, 0.0, 0.0)])
+    regained = [track.regained]
+    assert track.take(pose, sight(pose, Pose(2.0, 0.0, 0.0)))
+    assert not track.take(behind, sight(behind, Pose(1.2, 0.0, math.pi))), "turned back: where it came from is in view"
+    track.settle()
+    regained.append(track.regained)
+    assert track.take(behind, sight(behind, Pose(1.2, 0.0, math.pi)))
+    track.begin([Pose(3.0, 0.0, 0.0)])
+    assert [*regained, track.regained] == [False, True, False]
 
 
 def test_without_looking_no_sight_is_taken() -> None:
