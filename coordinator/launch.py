@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from coordinator.engine import Engine
+from coordinator.engine import Engine, Point
 from coordinator.executor import Executor
 from coordinator.journal import Journal, JournalWriter
 from coordinator.lockstep_party import NAME, CoordinatorParty
@@ -44,6 +44,8 @@ class Setting:
     runs: int | None = None
     seed: int = 1
     selector: Selector = field(default_factory=FirstAlternative)
+    point: Point | None = None
+    """Where a simulated run sets out, if not at the task's beginning."""
 
 
 def load_object(path: str) -> Any:
@@ -73,7 +75,9 @@ def make_mission(
     executor = Executor(task, engine, directory, callers, mission, setting.seed, setting.selector, store or Forgetful())
     if isinstance(setting.selector, Observer):
         executor.observers.append(setting.selector)
-    return Mission(executor, {**task.parameters, **setting.parameters}, runs)
+    made = Mission(executor, {**task.parameters, **setting.parameters}, runs)
+    made.point = setting.point
+    return made
 
 
 def make_callers(directory: Directory, boot: str, epoch: int, name: str = NAME) -> dict[str, Caller]:

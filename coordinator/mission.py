@@ -9,7 +9,7 @@ from typing import Any
 
 from coordinator.engine import Mode, State
 from coordinator.engine.instructions import Fired, Instruction, Report, RunRecorded, Severity, StartRun
-from coordinator.engine.stimuli import Begin, Stimulus
+from coordinator.engine.stimuli import Begin, Point, Stimulus
 from coordinator.executor import Executor
 from coordinator.net import Marking
 from coordinator.recording import PREPARED, SCORED, Step
@@ -115,6 +115,8 @@ class Mission:
         self.stage = Stage.CONNECTING
         self.score: Mapping[str, Any] = {}
         self.begun = self.ended = 0.0
+        self.point: Point | None = None
+        """Where the task begins, if not at its own beginning (a simulated run alone: no real world stands elsewhere at will)."""
         self.lost: dict[str, str] = {}
         """Nodes that are away, with the reason."""
         self._early: list[tuple[str, Notice]] = []
@@ -213,7 +215,7 @@ class Mission:
     def _begin(self, now: float) -> None:
         self.stage, self.begun = Stage.RUNNING, now
         self.executor.subscribe(now)
-        self.executor.stimulate(now, Begin(self.parameters))
+        self.executor.stimulate(now, Begin(self.parameters, point=self.point))
 
     def _finish(self, now: float, ended: float) -> None:
         self.ended = ended

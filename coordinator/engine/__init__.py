@@ -24,7 +24,13 @@ from coordinator.engine.instructions import (
     Subject,
 )
 from coordinator.engine.machine import Engine
-from coordinator.engine.plain import instruction_from_plain, state_from_plain, stimulus_from_plain, to_plain
+from coordinator.engine.plain import (
+    instruction_from_plain,
+    point_from_plain,
+    state_from_plain,
+    stimulus_from_plain,
+    to_plain,
+)
 from coordinator.engine.state import Mode, Phase, Run, State, Timer
 from coordinator.engine.step import Policy
 from coordinator.engine.stimuli import (
@@ -38,6 +44,7 @@ from coordinator.engine.stimuli import (
     Hold,
     Pause,
     RaiseEvent,
+    Point,
     RemoveTokens,
     Resume,
     RunEnded,
@@ -46,6 +53,7 @@ from coordinator.engine.stimuli import (
     RunStarted,
     SetBreakpoints,
     Step,
+    Standing,
     Stimulus,
     StopConfirmed,
     StopFailed,
@@ -82,6 +90,7 @@ __all__ = [
     "Phase",
     "Policy",
     "RaiseEvent",
+    "Point",
     "ReleaseRun",
     "ReleaseTimer",
     "RemoveTokens",
@@ -98,6 +107,7 @@ __all__ = [
     "Severity",
     "StartRun",
     "State",
+    "Standing",
     "Step",
     "Stimulus",
     "StopConfirmed",
@@ -110,5 +120,6 @@ __all__ = [
     "instruction_from_plain",
     "state_from_plain",
     "stimulus_from_plain",
+    "point_from_plain",
     "to_plain",
 ]

@@ -116,7 +116,7 @@ class Fired:
 
 @dataclass(frozen=True, slots=True)
 class Marked:
-    """Record: the operator changed the tokens of a control place."""
+    """Record: the operator changed the tokens of a control place, or the mission run began at another marking (no `place`)."""
 
     place: str
     before: Marking

@@ -8,6 +8,7 @@ from typing import Any
 from coordinator.conditions.wording import Severity
 from coordinator.engine import operator, runs
 from coordinator.engine.compiled import compile_task
+from coordinator.engine.departing import set_out
 from coordinator.engine.draft import Draft
 from coordinator.engine.firing import awaited
 from coordinator.engine.instructions import (
@@ -130,7 +131,7 @@ class Engine:
         elif run.phase in ACTIVE:
             deadline = primitive.deadline
             draft.emit(StartRun(run.id, run.place, primitive.name, run.action, run.arguments, deadline))
-            if run.phase is Phase.HELD:
+            if draft.mode is Mode.PAUSED:  # whether or not its node had answered: it may have been released since
                 draft.emit(HoldRun(run.id))
         elif run.phase in (Phase.STOPPING, Phase.STUCK):
             draft.emit(CancelRun(run.id, run.counts or Counts.NONE, run.reason, primitive.stop_within))
@@ -157,13 +158,16 @@ class Engine:
         for name, value in stimulus.parameters.items():
             if name not in task.parameters or not VariableType.of(task.parameters[name]).admits(value):
                 _warn(draft, "bad_parameter", f"{name} = {value!r} is no parameter of {task.name}; ignored", name)
+        if stimulus.point is not None:
+            set_out(draft, stimulus.point)
             else:
                 draft.write(name, value)
         for name, value in stimulus.variables.items():
             _write(draft, name, value)
-        for place, index in self.compiled.action_places.items():
-            for _ in range(draft.marking[index]):
-                draft.enter(place, index)
+        if stimulus.point is None:
+            for place, index in self.compiled.action_places.items():
+                for _ in range(draft.marking[index]):
+                    draft.enter(place, index)
         draft.touch_all()
         settle(draft, self.policy, "Begin")
 

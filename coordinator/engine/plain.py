@@ -15,13 +15,13 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from coordinator.engine.instructions import Instruction
 from coordinator.engine.state import State
-from coordinator.engine.stimuli import Stimulus
+from coordinator.engine.stimuli import Point, Stimulus
 
 Reader = Callable[[Any, str], Any]
 _KINDS: Mapping[str, type] = {c.__name__: c for c in (*get_args(Stimulus), *get_args(Instruction))}
 
 
-def to_plain(record: State | Stimulus | Instruction) -> dict[str, Any]:
+def to_plain(record: State | Stimulus | Instruction | Point) -> dict[str, Any]:
     """The record as plain data."""
     plain: dict[str, Any] = _plain(record)
     return plain
@@ -37,6 +37,12 @@ def stimulus_from_plain(data: Mapping[str, Any]) -> Stimulus:
     """The stimulus that `to_plain` described. Raises ValueError."""
     stimulus: Stimulus = _tagged(Stimulus, data)
     return stimulus
+
+
+def point_from_plain(data: Mapping[str, Any]) -> Point:
+    """The point that `to_plain` described. Raises ValueError."""
+    point: Point = _reader(Point)(data, "point")
+    return point
 
 
 def instruction_from_plain(data: Mapping[str, Any]) -> Instruction:

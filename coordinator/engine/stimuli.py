@@ -10,11 +10,39 @@ from coordinator.task import Executed, Status, Value
 
 
 @dataclass(frozen=True, slots=True)
+class Standing:
+    """A token in an action place where a mission run begins: its run begins anew, or is over with a status."""
+
+    place: str
+    status: Status | None = None
+    """How it ended; None: it begins anew."""
+    cause: str = ""
+    action: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """Where a mission run begins that does not begin at the task's own beginning."""
+
+    marking: Mapping[str, int] = field(default_factory=dict)
+    """Tokens by resource and control place; places that are not named hold none."""
+    standing: tuple[Standing, ...] = ()
+    """The tokens of action places: those whose runs are over first, in the order in which they ended, then by age."""
+    variables: Mapping[str, Value] = field(default_factory=dict)
+    flags: frozenset[str] = frozenset()
+    """Latched external events that have come and wait."""
+
+
+@dataclass(frozen=True, slots=True)
 class Begin:
-    """The mission run begins. Given parameters replace the task's defaults; `variables` are what global memory holds."""
+    """The mission run begins. Given parameters replace the task's defaults; `variables` are what global memory holds.
+
+    With a `point` it begins there and not at the task's initial marking.
+    """
 
     parameters: Mapping[str, Value] = field(default_factory=dict)
     variables: Mapping[str, Value] = field(default_factory=dict)
+    point: Point | None = None
 
 
 @dataclass(frozen=True, slots=True)
