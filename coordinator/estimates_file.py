@@ -2,7 +2,8 @@
 
 Every file has an origin of its own, and keeps the sums of each origin apart. A merge takes the later version of each origin's
 sums, so merging is idempotent, commutative and associative: no run counts twice, however often and in whatever order files
-travel. What was reset stays forgotten: its origins are remembered as such.
+travel. What was reset stays forgotten: its origins are remembered as such. A copy of a file becomes an origin of its own as soon
+as something is added to it, so two copies that both went on lose nothing when they meet.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from typing import Any
 
 from coordinator.learning.estimate import Key, Tally
 from coordinator.learning.estimate import merge as merge_tallies
+from coordinator.learning.joining import joined, trials
 from coordinator.learning.learning import Estimates
 from coordinator.learning.moments import Moments
 from coordinator.learning.passage import Flow, PassageKey
@@ -28,6 +30,10 @@ APPLICATION = 0x70657472
 """"petr": SQLite's application_id of these files."""
 BUSY = 20.0
 """Seconds that a command waits for another one that is writing the file."""
+MACHINE_ID = Path("/etc/machine-id")
+"""Tells machines apart (machine-id(5)); where there is none, the file's inode alone tells copies apart."""
+CHOICE = "choice of "
+"""Before a primitive task's name in the table `forgotten`: its selectors' states are forgotten, not its estimates."""
 
 TABLES = """
 CREATE TABLE about(name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
@@ -79,6 +85,8 @@ class EstimatesFile:
             return self._kept(db)
 
     def _kept(self, db: sqlite3.Connection) -> Kept:
+        if _is_empty(db):  # made, but killed before anything was written
+            return Kept()
         about = dict(db.execute("SELECT name, value FROM about"))
         kept = Kept(about["origin"], int(about["generation"]))
         for task, action, context, body in db.execute("SELECT primitive_task, action, context, body FROM tally"):
@@ -96,6 +104,8 @@ class EstimatesFile:
         if not self.path.exists():
             return 0
         with self._open() as db:
+            if _is_empty(db):
+                return 0
             row = db.execute("SELECT records FROM mission WHERE id = ?", (mission,)).fetchone()
             return int(row[0]) if row else 0
 
@@ -136,7 +146,13 @@ class EstimatesFile:
         """Forget a primitive task (None: everything): selectors' states, and estimates unless `selectors_only`."""
         with self._writing() as db:
             which, given = ("WHERE primitive_task = ?", (primitive_task,)) if primitive_task else ("", ())
+            own = _about(db, "origin")
+            choices = [
+                (own, CHOICE + task) for (task,) in db.execute(f"SELECT primitive_task FROM selector {which}", given)
+            ]
+            db.executemany("INSERT OR IGNORE INTO forgotten VALUES (?, ?)", choices)
             db.execute(f"DELETE FROM selector {which}", given)
+            _renew_origin(db)
             if selectors_only:
                 return
             db.execute(
@@ -146,7 +162,6 @@ class EstimatesFile:
             if primitive_task is None:
                 db.execute("INSERT OR IGNORE INTO forgotten SELECT DISTINCT origin, '' FROM flow")
                 db.execute("DELETE FROM flow")
-            db.execute("UPDATE about SET value = ? WHERE name = 'origin'", (secrets.token_hex(8),))
 
     def merge(self, other: Path) -> None:
         """Take in another file. Raises EstimatesError.
@@ -156,30 +171,23 @@ class EstimatesFile:
         if not other.exists():
             raise EstimatesError(f"{other}: no such file; give an estimates file that `run --learn` has made")
         with EstimatesFile(other)._open() as db:
+            if _is_empty(db):
+                return
+            origin = _about(db, "origin")
             rows = {name: db.execute(f"SELECT * FROM {name}").fetchall() for name in ("tally", "flow", "selector")}
             gone = db.execute("SELECT * FROM forgotten").fetchall()
             for *_, body in rows["tally"]:
                 _tally(body)
             for *_, body in rows["flow"]:
                 _flow(body)
+            states = [(task, name, _state(body)) for task, name, _, body in rows["selector"]]
         with self._writing() as mine:
             _take_later(mine, "tally", rows["tally"], "origin, primitive_task, action, context")
             _take_later(mine, "flow", rows["flow"], "origin, task, transition_name, context")
-            for task, name, trials, state in rows["selector"]:
-                mine.execute(
-                    "INSERT INTO selector VALUES (?1, ?2, ?3, ?4) ON CONFLICT DO UPDATE SET trials = ?3, state = ?4 "
-                    "WHERE ?3 > trials",
-                    (task, name, trials, state),
-                )
+            for task, name, state in states:
+                _take_selector(mine, task, name, state, origin)
             mine.executemany("INSERT OR IGNORE INTO forgotten VALUES (?, ?)", gone)
-            mine.execute(
-                "DELETE FROM tally WHERE EXISTS (SELECT 1 FROM forgotten f WHERE f.origin = tally.origin "
-                "AND f.primitive_task = tally.primitive_task)"
-            )
-            mine.execute(
-                "DELETE FROM flow WHERE EXISTS (SELECT 1 FROM forgotten f WHERE f.origin = flow.origin "
-                "AND f.primitive_task = '')"
-            )
+            _forget(mine)
 
     # --- the database ----------------------------------------------------------------------------------------------
 
@@ -192,8 +200,9 @@ class EstimatesFile:
             raise EstimatesError(f"{self.path}: {fault.strerror}; give a folder that can be made") from fault
         with self._open() as db:
             db.execute("BEGIN IMMEDIATE")
-            if db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0:
+            if _is_empty(db):
                 self._make(db)
+            self._settle(db)
             yield db
             db.execute("COMMIT")
 
@@ -205,6 +214,14 @@ class EstimatesFile:
         db.execute(f"PRAGMA user_version = {SCHEMA}")
         db.execute("INSERT INTO about VALUES ('origin', ?)", (self._origin or secrets.token_hex(8),))
         db.execute("INSERT INTO about VALUES ('generation', '0')")
+
+    def _settle(self, db: sqlite3.Connection) -> None:
+        """A file that was copied here is an origin of its own from now on; the sums that came along stay the old one's."""
+        here = _home(self.path)
+        known = db.execute("SELECT value FROM about WHERE name = 'home'").fetchone()
+        if known is not None and known[0] != here:
+            _renew_origin(db)
+        db.execute("INSERT OR REPLACE INTO about VALUES ('home', ?)", (here,))
 
     @contextmanager
     def _open(self) -> Iterator[sqlite3.Connection]:
@@ -225,7 +242,7 @@ class EstimatesFile:
             ) from fault
 
     def _check(self, db: sqlite3.Connection) -> None:
-        empty = db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0
+        empty = _is_empty(db)
         (application,), (version,) = (db.execute(f"PRAGMA {p}").fetchone() for p in ("application_id", "user_version"))
         if empty and not application and not version:
             return
@@ -236,6 +253,20 @@ class EstimatesFile:
                 f"{self.path}: written with schema {version}, this petrobot reads {SCHEMA}; "
                 f"{'upgrade petrobot' if version > SCHEMA else 'start a new file'} or give another one"
             )
+
+
+def _home(path: Path) -> str:
+    """Which file on which machine this is: another one after copying, the same after renaming."""
+    machine = MACHINE_ID.read_text(encoding="ascii", errors="replace").strip() if MACHINE_ID.is_file() else ""
+    return f"{machine}:{path.stat().st_ino}"
+
+
+def _is_empty(db: sqlite3.Connection) -> bool:
+    return int(db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]) == 0
+
+
+def _renew_origin(db: sqlite3.Connection) -> None:
+    db.execute("UPDATE about SET value = ? WHERE name = 'origin'", (secrets.token_hex(8),))
 
 
 def _about(db: sqlite3.Connection, name: str) -> str:
@@ -263,9 +294,32 @@ def _add_flow(db: sqlite3.Connection, origin: str, key: PassageKey, gained: Flow
 
 
 def _put_selector(db: sqlite3.Connection, task: str, state: Mapping[str, Any]) -> None:
-    trials = sum(float(learner["k"]) for learner in state["learners"].values())
     body = json.dumps(state, separators=(",", ":"))
-    db.execute("INSERT OR REPLACE INTO selector VALUES (?, ?, ?, ?)", (task, state["selector"], trials, body))
+    db.execute("INSERT OR REPLACE INTO selector VALUES (?, ?, ?, ?)", (task, state["selector"], trials(state), body))
+
+
+def _take_selector(db: sqlite3.Connection, task: str, name: str, state: Mapping[str, Any], origin: str) -> None:
+    """Another file's state, unless what was learned there under that origin was reset here."""
+    if db.execute(
+        "SELECT 1 FROM forgotten WHERE origin = ? AND primitive_task = ?", (origin, CHOICE + task)
+    ).fetchone():
+        return
+    row = db.execute("SELECT state FROM selector WHERE primitive_task = ? AND name = ?", (task, name)).fetchone()
+    _put_selector(db, task, state if row is None else joined(_state(row[0]), state))
+
+
+def _forget(db: sqlite3.Connection) -> None:
+    """Drop what some file has reset; if that was this file's own, what it learns from now on is another origin's."""
+    db.execute(
+        "DELETE FROM tally WHERE EXISTS (SELECT 1 FROM forgotten f WHERE f.origin = tally.origin "
+        "AND f.primitive_task = tally.primitive_task)"
+    )
+    db.execute(
+        "DELETE FROM flow WHERE EXISTS (SELECT 1 FROM forgotten f WHERE f.origin = flow.origin "
+        "AND f.primitive_task = '')"
+    )
+    if db.execute("SELECT 1 FROM forgotten WHERE origin = ?", (_about(db, "origin"),)).fetchone():
+        _renew_origin(db)
 
 
 def _take_later(db: sqlite3.Connection, table: str, rows: list[tuple[Any, ...]], key: str) -> None:
@@ -279,6 +333,12 @@ def _take_later(db: sqlite3.Connection, table: str, rows: list[tuple[Any, ...]],
 
 def _tally(body: str) -> Tally:
     return Tally.of_plain(json.loads(body))
+
+
+def _state(body: str) -> dict[str, Any]:
+    state: dict[str, Any] = json.loads(body)
+    trials(state)
+    return state
 
 
 def _flow(body: str) -> Flow:

@@ -69,9 +69,9 @@ class LearningSession:
         kept = self.file.read()
         contexts = usual_contexts(task) if setting.contexts is None else Contexts(setting.contexts)
         generation = kept.generation if begun is None else int(begun["generation"])
-        self.learning = _learning(task, setting, kept, None if begun is None else begun["selectors"])
         self._generation = generation
         self._token = secrets.token_hex(8) if begun is None else str(begun["token"])
+        self.learning = _learning(task, setting, kept, None if begun is None else begun["selectors"], self._token)
         self._begun = self.learning.state()
         self.selector = LearningSelector(
             self.learning,
@@ -109,10 +109,10 @@ class LearningSession:
 
 
 def _learning(
-    task: Task, setting: LearningSetting, kept: Kept, states: Mapping[str, Mapping[str, Any]] | None
+    task: Task, setting: LearningSetting, kept: Kept, states: Mapping[str, Mapping[str, Any]] | None, salt: str
 ) -> Learning:
+    """`salt` names the session, so that its runs in the kept sample are told from any other's, a copied file's included."""
     question = Question(target=setting.target)
-    salt = f"{kept.origin}/{kept.generation}"
     learning = Learning(task, setting.selector, question, kept.estimates, salt)
     try:
         learning.restore(kept.states(setting.selector) if states is None else states)

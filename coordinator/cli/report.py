@@ -1,9 +1,10 @@
-"""Write a report of a mission run or a campaign: one self-contained HTML page, and its pictures as SVG files."""
+"""Write a report of a mission run or a campaign: one self-contained HTML page, and its pictures as SVG and PNG files."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,8 +13,13 @@ from coordinator.cli import CommandError
 from coordinator.cli.loading import load_task, pictures_of, write_json
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from coordinator.campaign.plan import Plan
     from coordinator.campaign.rows import Row
+    from coordinator.cli.replaying import Recorded
+    from coordinator.recording import Step
+    from coordinator.report.observed_run import ObservedRun
     from coordinator.task import Task
 
 EXAMPLE = "petrobot report campaigns/catch_ball-nikolic_fu-1 --against campaigns/catch_ball-fixed-1 --out report.html"
@@ -56,19 +62,35 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _write(page: Path, html: str, pictures: Mapping[str, str], *, quiet: bool) -> None:
-    from coordinator.report.page import standalone
+    from coordinator.report.colours import standalone
+    from coordinator.report.raster import unavailable
 
     beside = page.with_name(f"{page.stem}_pictures")
+    missing = unavailable()
     try:
         beside.mkdir(parents=True, exist_ok=True)
         page.write_text(html, encoding="utf-8")
         for name, svg in pictures.items():
-            (beside / f"{name}.svg").write_text(standalone(svg), encoding="utf-8")
+            _draw(beside / name, standalone(svg), raster=not missing)
     except OSError as fault:
         raise CommandError(2, f"{page}: {fault.strerror or fault}; give --out a file that can be written") from fault
     if not quiet:
         print(f"report: {page}")
-        print(f"pictures: {beside} ({len(pictures)} SVG files)")
+        print(f"pictures: {beside} ({len(pictures)} as SVG{'' if missing else ' and PNG'})")
+        if missing:
+            print(f"no PNG: {missing}")
+
+
+def _draw(path: Path, svg: str, *, raster: bool) -> None:
+    """A picture's files. A task's own picture that only browsers understand stays an SVG."""
+    from coordinator.report.raster import RasterError, png
+
+    path.with_name(f"{path.name}.svg").write_text(svg, encoding="utf-8")
+    if raster:
+        try:
+            path.with_name(f"{path.name}.png").write_bytes(png(svg))
+        except RasterError as fault:
+            print(f"{path}.svg: no PNG: {fault}", file=sys.stderr)
 
 
 # --- campaigns -----------------------------------------------------------------------------------------------------------
@@ -135,33 +157,56 @@ def _plots(folder: Path) -> dict[str, Any]:
 def _run(name: str) -> tuple[str, dict[str, str], Path]:
     from coordinator.cli.replaying import recorded
     from coordinator.drawing import draw
-    from coordinator.journal import JournalError
-    from coordinator.recording import ReplayError
     from coordinator.report.run_page import gantt_svg, own_pictures, report_html
     from coordinator.runfolder import RESULT
     from coordinator.timeline import Timeline
 
     found = recorded(name)
-    timeline = Timeline()
+    timeline, observed = Timeline(), _observer(found)
+    for step in _steps(found):
+        timeline.stimulus(step.time, step.stimulus)
+        for instruction in step.instructions:
+            timeline.instruction(step.time, instruction)
+        observed.step(step)
+    folder = found.journal.path.parent
+    result = _result_of(folder / RESULT, found.task)
+    drawn, net, measured = pictures_of(found.task, result), draw(found.task, error_branches=True), observed.pictures()
+    headings = list(dict.fromkeys(heading for heading, _ in measured.values()))
+    sections = {heading: [svg for own, svg in measured.values() if own == heading] for heading in headings}
+    page = report_html({**result, "mission": found.journal.header["mission"]}, timeline, net, drawn, sections)
+    own = {f"own_{i}": svg for i, svg in enumerate([*own_pictures(result).values(), *drawn.values()], 1)}
+    pictures = {"gantt": gantt_svg(timeline), "net": net, **{name: svg for name, (_, svg) in measured.items()}, **own}
+    return page, pictures, folder / "report.html"
+
+
+def _observer(found: Recorded) -> ObservedRun:
+    """What sees the run's actions; with the selector that learned in it, as far as its estimates file is still there."""
+    from coordinator.estimates_file import EstimatesError
+    from coordinator.learning_session import session_of
+    from coordinator.report.observed_run import ObservedRun
+
     try:
-        for step in found.steps():
-            timeline.stimulus(step.time, step.stimulus)
-            for instruction in step.instructions:
-                timeline.instruction(step.time, instruction)
+        session = session_of(found.task, found.journal.header)
+    except (EstimatesError, ValueError) as fault:
+        print(f"no learned probabilities: {fault}", file=sys.stderr)
+        session = None
+    return ObservedRun(found.task, None if session is None else session.selector)
+
+
+def _steps(found: Recorded) -> Iterator[Step]:
+    from coordinator.journal import JournalError
+    from coordinator.recording import ReplayError
+
+    try:
+        yield from found.steps()
     except JournalError as fault:
         raise CommandError(2, str(fault)) from fault
     except ReplayError as fault:
         raise CommandError(1, str(fault)) from fault
-    folder = found.journal.path.parent
-    path = folder / RESULT
-    header = found.journal.header
-    result = (
-        json.loads(path.read_text(encoding="utf-8"))
-        if path.exists()
-        else {"task": found.task.name, "reason": "no result"}
-    )
-    drawn = pictures_of(found.task, result)
-    net = draw(found.task, error_branches=True)
-    page = report_html({**result, "mission": header["mission"]}, timeline, net, drawn)
-    pictures = {f"own_{i}": svg for i, svg in enumerate([*own_pictures(result).values(), *drawn.values()], 1)}
-    return page, {"gantt": gantt_svg(timeline), **pictures}, folder / "report.html"
+
+
+def _result_of(path: Path, task: Task) -> dict[str, Any]:
+    if not path.exists():
+        return {"task": task.name, "reason": "no result"}
+    result: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return result

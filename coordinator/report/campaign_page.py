@@ -13,20 +13,30 @@ from coordinator.campaign.summary import Summary, comparisons
 from coordinator.campaign.throws import Throw
 from coordinator.learning.objective import Figures, break_even, pareto
 from coordinator.report import charts
+from coordinator.report.action_pictures import (
+    ACTIONS,
+    TRIALS,
+    action_pictures,
+    add_latencies,
+    latency_svg,
+    put,
+    trial_pictures,
+)
 from coordinator.report.combinations import by_combination
 from coordinator.report.page import gallery, html_page, section, table, text
 from coordinator.report.plots import declared
 from coordinator.report.run_page import gantt_svg
-from coordinator.report.trials import Trials, learned_curves, objective_curves
+from coordinator.report.trials import learned_curves, objective_curves
 from coordinator.task import Status, Task
 from coordinator.timeline import Bar, Timeline
 
+DIFFERENCES = "Differences, paired"
+AHEAD = (DIFFERENCES, TRIALS, ACTIONS)
+"""Headings of pictures that stand before the tables of actions."""
 MOST = 12
 """Combinations that are listed."""
 WORST = 40
 """Throws that went wrong which are listed."""
-LATENCY = "latency"
-"""Numbers of results whose names begin so are drawn: seconds from an image to the set point that it led to, and the like."""
 
 
 class CampaignReport:
@@ -37,55 +47,16 @@ class CampaignReport:
         self.summary = Summary.of(task, rows)
         self.trials = objective_curves(task, rows)
         learned_curves(plan, rows, self.trials)
-        self.pictures: dict[str, tuple[str, str]] = {}
-        self._trials()
-        self._actions()
+        word = "choice probability" if plan.batch else "share of choices"
+        self.pictures = trial_pictures(self.trials, word) | action_pictures(task, self.summary.estimates)
         self._own(plots)
         self._times()
         self._gantt()
 
-    def _add(self, name: str, heading: str, svg: str) -> None:
-        self.pictures["".join(c if c.isalnum() else "_" for c in name)] = (heading, svg)
-
     # --- pictures ----------------------------------------------------------------------------------------------------
 
-    def _trials(self) -> None:
-        word = "choice probability" if self.plan.batch else "share of choices"
-        for one in self.trials:
-            where = f"{one.primitive_task}{', ' + one.regime if one.regime else ''}"
-            if one.probability:
-                svg = charts.lines(f"{where}: {word}", "trial", word, one.probability, unit=True)
-                self._add(f"probability {where}", "Choices and J over trials", svg)
-            if one.objective:
-                svg = charts.lines(f"{where}: J = 1 - R + rho C", "trial", "J", _settled(one))
-                self._add(f"objective {where}", "Choices and J over trials", svg)
-
-    def _actions(self) -> None:
-        for primitive in self.task.primitive_tasks:
-            reliability, cost = [], []
-            for key, tally in sorted(self.summary.estimates.tallies.items()):
-                if key.primitive_task != primitive or not tally.runs:
-                    continue
-                low, high = tally.interval()
-                reliability.append((key.action, regime_of(key.context), low, tally.reliability, high))
-                spent = tally.cost(self.task.primitive_tasks[primitive].cost)
-                if spent.n:
-                    half = 1.96 * spent.deviation / spent.n**0.5
-                    cost.append((key.action, regime_of(key.context), spent.mean - half, spent.mean, spent.mean + half))
-            if reliability:
-                title = f"{primitive}: R with 95 % interval"
-                self._add(
-                    f"reliability {primitive}",
-                    "Reliability and cost of each action",
-                    charts.intervals(title, "R", reliability, unit=True),
-                )
-            if cost:
-                unit = self.task.primitive_tasks[primitive].cost
-                label = {"wall": "C (s)", "cpu": "C (s of computing)"}.get(unit, f"C ({unit.removeprefix('value:')})")
-                title = f"{primitive}: mean cost with 95 % interval"
-                self._add(
-                    f"cost {primitive}", "Reliability and cost of each action", charts.intervals(title, label, cost)
-                )
+    def _add(self, name: str, heading: str, svg: str) -> None:
+        put(self.pictures, name, heading, svg)
 
     def _own(self, plots: Mapping[str, Any]) -> None:
         scores = [{**row.score, "n": row.n, "regime": row.regime} for row in self.rows]
@@ -101,13 +72,11 @@ class CampaignReport:
             if row.throw.time is not None:
                 times.setdefault(row.regime or "time", []).append(row.throw.time)
             for run in row.throw.runs:
-                for name, value in run.values.items():
-                    if name.startswith(LATENCY):
-                        latencies.setdefault(f"{run.action}: {name}", []).append(value)
+                add_latencies(latencies, run.action, run.values)
         if times:
             self._add("times", "Times", charts.histogram("Time of a run of the task", "s", times))
         if latencies:
-            self._add("latencies", "Times", charts.histogram("Latencies that runs reported", "s", latencies))
+            self._add("latencies", "Times", latency_svg(latencies))
 
     def _gantt(self) -> None:
         block = next((row.block for row in self.rows if row.throw is not None), None)
@@ -135,10 +104,10 @@ class CampaignReport:
             f'<p class="lead">{escape(lead)}</p>',
             section("Results", table(self._results())),
             *more,
-            *(section(h, self._gallery(h)) for h in headings[:2]),
+            *(section(h, self._gallery(h)) for h in headings if h in AHEAD),
             section("Actions", "".join(self._judged())),
             *(section(f"Combinations, regime {r or '-'}", table(rows)) for r, rows in self._combinations().items()),
-            *(section(h, self._gallery(h)) for h in headings[2:]),
+            *(section(h, self._gallery(h)) for h in headings if h not in AHEAD),
             section("Ends of runs and their causes", table(self._causes())),
             section("What went wrong, firing by firing", self._worst()),
         ]
@@ -217,13 +186,6 @@ class CampaignReport:
             return "<p>Nothing: every run met its specification.</p>"
         left = f"<p>{len(bad) - WORST} more in the table.</p>" if len(bad) > WORST else ""
         return f"<details open><summary>{len(bad)} runs of the task</summary>{table(rows)}{left}</details>"
-
-
-def _settled(trials: Trials) -> dict[str, list[tuple[float, float]]]:
-    """J curves without the first few trials, where a single failure hides everything else."""
-    last = max((points[-1][0] for points in trials.objective.values()), default=0.0)
-    kept = {a: [p for p in points if p[0] > 0.02 * last] or points for a, points in trials.objective.items()}
-    return dict(kept)
 
 
 def _action_row(f: Figures, front: set[str], best: Figures | None) -> dict[str, Any]:
@@ -312,7 +274,7 @@ def comparison_pictures(found: Mapping[str, Any], one: str, other: str) -> dict[
     rows = [(name, "", *_ends(row)) for name, row in found["shares"].items()]
     rows += [(_objective_name(name), "", *_ends(row)) for name, row in found["J"].items()]
     svg = charts.intervals(f"{one} minus {other}, 95 % intervals, paired", "difference", rows)
-    return {"comparison": (f"{one} against {other}", svg)}
+    return {"comparison": (DIFFERENCES, svg)}
 
 
 def _ends(row: Mapping[str, Any]) -> tuple[float, float, float]:

@@ -1,6 +1,7 @@
-"""Small charts as SVG: lines over trials, intervals by name, points, segments and histograms. Each is a file of its own.
+"""Small charts as SVG: lines over trials, intervals by name, points, segments and histograms.
 
-Colours are Okabe and Ito's (2008), told apart with every kind of colour vision; every mark also differs by shape or dash.
+Colours are those of the page they stand in, by day and by night (`coordinator/report/colours.py`, whose `standalone` makes a file
+of its own of a chart); every mark also differs by shape or dash.
 """
 
 from __future__ import annotations
@@ -11,9 +12,11 @@ from dataclasses import dataclass, field
 from html import escape
 from itertools import pairwise
 
-PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7a6a00", "#555555")
+from coordinator.report.colours import SERIES
+
+PALETTE = tuple(f"var(--{name})" for name in SERIES)
 DASHES = ("", "7 3", "2 3", "9 3 2 3", "4 2", "1 2", "12 3", "6 2 2 2")
-INK, SOFT, LINE, PAPER = "#1b1f24", "#5b6570", "#d7dce1", "#ffffff"
+INK, SOFT, LINE, PAPER = "var(--ink)", "var(--soft)", "var(--line)", "var(--paper)"
 TOP, BOTTOM, RIGHT = 40, 46, 18
 FONT = 'font-family="system-ui,Segoe UI,Roboto,DejaVu Sans,sans-serif" font-size="12"'
 LETTER = 6.6

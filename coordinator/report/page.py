@@ -7,14 +7,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
+from coordinator.report.colours import DARK, LIGHT, variables
 from coordinator.task import Status
 
-STYLE = """
-:root{color-scheme:light dark;--ink:#1b1f24;--soft:#5b6570;--line:#d7dce1;--paper:#fff;--panel:#f5f7f9;
---success:#1a7f4b;--failure:#b7791f;--error:#c0362c;--none:#7a8794}
-@media (prefers-color-scheme:dark){:root{--ink:#e8ecf0;--soft:#9aa6b2;--line:#343b43;--paper:#14181c;--panel:#1d2329;
---success:#43b97f;--failure:#e0a94a;--error:#ef6f64;--none:#8794a1}}
-body{margin:0 auto;max-width:1100px;padding:2rem 1.5rem 4rem;background:var(--paper);color:var(--ink);
+STYLE = (
+    f"""
+:root{{color-scheme:light dark;{variables(LIGHT)}}}
+@media (prefers-color-scheme:dark){{:root{{{variables(DARK)}}}}}
+"""
+    + """body{margin:0 auto;max-width:1100px;padding:2rem 1.5rem 4rem;background:var(--paper);color:var(--ink);
 font:15px/1.5 system-ui,"Segoe UI",Roboto,"DejaVu Sans",sans-serif}
 h1{font-size:1.7rem;margin:0 0 .25rem}h2{font-size:1.15rem;margin:2.2rem 0 .6rem}
 p.lead{color:var(--soft);margin:0 0 1.5rem}
@@ -30,6 +31,7 @@ h3{margin:1.2rem 0 .3rem;font-size:1rem}h3 small{color:var(--soft);font-weight:4
 .wide{overflow-x:auto}
 details summary{cursor:pointer;color:var(--soft)}
 """
+)
 
 
 def html_page(title: str, parts: Iterable[str]) -> str:
@@ -39,27 +41,6 @@ def html_page(title: str, parts: Iterable[str]) -> str:
         f'<meta name="viewport" content="width=device-width,initial-scale=1"><style>{STYLE}</style></head>'
         f"<body>{''.join(parts)}</body></html>\n"
     )
-
-
-LIGHT = {
-    "ink": "#1b1f24",
-    "soft": "#5b6570",
-    "line": "#d7dce1",
-    "paper": "#fff",
-    "panel": "#f5f7f9",
-    "success": "#1a7f4b",
-    "failure": "#b7791f",
-    "error": "#c0362c",
-    "none": "#7a8794",
-}
-"""The page's colours by day, as in STYLE."""
-
-
-def standalone(svg: str) -> str:
-    """A picture of a page as a file of its own: with the page's light colours and a name space."""
-    for name, colour in LIGHT.items():
-        svg = svg.replace(f"var(--{name})", colour)
-    return svg if "xmlns=" in svg[:400] else svg.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
 
 
 def gallery(pictures: Iterable[str]) -> str:

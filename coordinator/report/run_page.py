@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
@@ -19,9 +19,16 @@ LONGEST = 600.0
 
 
 def report_html(
-    result: Mapping[str, Any], timeline: Timeline, net_svg: str = "", pictures: Mapping[str, str] | None = None
+    result: Mapping[str, Any],
+    timeline: Timeline,
+    net_svg: str = "",
+    pictures: Mapping[str, str] | None = None,
+    measured: Mapping[str, Sequence[str]] | None = None,
 ) -> str:
-    """The page. `result` is the mission's result; its lists of records become tables. `pictures`: more SVG texts by title."""
+    """The page. `result` is the mission's result; its lists of records become tables.
+
+    SVG texts: `pictures`, the task's own by title; `measured`, those of its actions by heading.
+    """
     title = f"{result.get('task', 'task')}: {result.get('status', '')}"
     parts = [
         f"<h1>{escape(str(result.get('task', 'task')))}</h1>",
@@ -29,6 +36,7 @@ def report_html(
         numbers(result),
         section("Of the task itself", gallery([*own_pictures(result).values(), *(pictures or {}).values()])),
         section("Runs over time", picture(gantt_svg(timeline))),
+        *(section(heading, gallery(svgs)) for heading, svgs in (measured or {}).items()),
         *(section(key.capitalize(), table(rows)) for key, rows in result.items() if is_table(rows)),
         section("The net", apart(net_svg, "the net") if net_svg else ""),
         section("What went wrong", _faults(timeline)),
@@ -87,9 +95,22 @@ def _bar(bar: Bar, row: int, scale: float, end: float, left: int) -> str:
     name = f"{bar.run}: {bar.action}, {bar.begun:.2f} to {ended:.2f} s"
     why = f" ({bar.cause}: {bar.text})" if bar.cause else ""
     how = bar.status.value if bar.status else "preempted"
+    x, width = left + bar.begun * scale, max(1.5, (ended - bar.begun) * scale)
+    tip = f"<title>{escape(f'{name}, {how}{why}')}</title>"
     return (
-        f'<rect x="{left + bar.begun * scale:.2f}" y="{ROW * row + 5}" width="{max(1.5, (ended - bar.begun) * scale):.2f}" '
-        f'height="{ROW - 9}" rx="3" fill="{colour}"><title>{escape(f"{name}, {how}{why}")}</title></rect>'
+        f'<rect x="{x:.2f}" y="{ROW * row + 5}" width="{width:.2f}" height="{ROW - 9}" rx="3" fill="{colour}">{tip}</rect>'
+        + _letter(bar, x + width / 2, row)
+    )
+
+
+def _letter(bar: Bar, x: float, row: int) -> str:
+    """What the colour says once more, on the bar, for runs that met no specification: F, E, or P for a preempted one."""
+    if bar.status is Status.SUCCESS:
+        return ""
+    letter = bar.status.value[0].upper() if bar.status else "P"
+    return (
+        f'<text x="{x:.2f}" y="{ROW * row + 18}" text-anchor="middle" font-size="11" font-weight="700" fill="var(--ink)" '
+        f'stroke="var(--paper)" stroke-width="3" paint-order="stroke" pointer-events="none">{letter}</text>'
     )
 
 

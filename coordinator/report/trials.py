@@ -1,15 +1,19 @@
-"""How choices, reliabilities and J went over the trials of a campaign, derived again from its table."""
+"""How choices, reliabilities and J went over the trials of a campaign, derived again from its table, or of a recorded run."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 
 from coordinator.campaign.block import Bench
+from coordinator.campaign.observed import regime_of
 from coordinator.campaign.plan import Plan
 from coordinator.campaign.policies import Learned, policy_of
 from coordinator.campaign.rows import Row
+from coordinator.learning.records import End, Record
+from coordinator.learning.selectors import cost_of
 from coordinator.task import Status, Task
 
 Curve = list[tuple[float, float]]
@@ -26,6 +30,8 @@ class Trials:
 
     primitive_task: str
     regime: str
+    context: str = ""
+    """Of a single run: the context that `regime` was told from."""
     probability: Curves = field(default_factory=dict)
     """Learned p; of campaigns that do not learn, the share of choices over the last `WINDOW` trials."""
     objective: Curves = field(default_factory=dict)
@@ -44,6 +50,24 @@ def objective_curves(task: Task, rows: Sequence[Row]) -> list[Trials]:
                 made = Trials(primitive.name, regime)
                 _fill(made, runs, primitive.alternatives)
                 out.append(made)
+    return out
+
+
+def recorded_curves(task: Task, records: Iterable[Record]) -> list[Trials]:
+    """The same of a single mission run, from what was observed of it."""
+    runs: dict[tuple[str, str], list[tuple[str, bool, float | None]]] = {}
+    for record in records:
+        if isinstance(record, End) and record.outcome.status is not None:
+            cost = cost_of(record.outcome, task.primitive_tasks[record.primitive_task].cost)
+            seen = (record.action, record.outcome.status is Status.SUCCESS, None if math.isnan(cost) else cost)
+            runs.setdefault((record.primitive_task, record.context), []).append(seen)
+    out = []
+    for (name, context), seen_runs in runs.items():
+        alternatives = task.primitive_tasks[name].alternatives
+        if len(alternatives) > 1:
+            made = Trials(name, regime_of(context), context)
+            _fill(made, seen_runs, alternatives)
+            out.append(made)
     return out
 
 

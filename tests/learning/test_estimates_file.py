@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
 from itertools import permutations
 from pathlib import Path
@@ -120,6 +121,110 @@ def test_the_selector_that_learned_from_more_is_kept(tmp_path: Path) -> None:
     assert many.read().states("nikolic_fu")["pick"] == states[1]
     few.merge(many.path)
     assert few.read().states("nikolic_fu")["pick"] == states[1]
+
+
+def state_of(name: str, learned: dict[str, int], action: str = "pick_slow") -> dict[str, Any]:
+    """A selector's state after so many successes of one action by context."""
+    selector = make(name, ("pick_fast", "pick_slow"))
+    for context, trials in learned.items():
+        for _ in range(trials):
+            selector.chosen(context, action)
+            selector.update(context, action, Observation(Status.SUCCESS, 1.0))
+    return selector.state()
+
+
+def test_what_was_learned_in_different_contexts_is_joined(tmp_path: Path) -> None:
+    """One machine learned in A and B, the other in B and C: of each context whoever knows more, whoever takes in whom."""
+    states = [state_of("nikolic_fu", {"A": 9, "B": 4}), state_of("nikolic_fu", {"B": 7, "C": 2}, "pick_fast")]
+    expected = {context: states[i]["learners"][context] for context, i in (("A", 0), ("B", 1), ("C", 1))}
+    for order in ((0, 1), (1, 0)):
+        one, other = (EstimatesFile(tmp_path / f"{order[0]}{i}.db") for i in order)
+        one.add(Estimates(), {"pick": states[order[0]]})
+        other.add(Estimates(), {"pick": states[order[1]]})
+        one.merge(other.path)
+        assert one.read().states("nikolic_fu")["pick"]["learners"] == expected
+
+
+def test_states_over_other_actions_are_not_mixed(tmp_path: Path) -> None:
+    """Numbers by position mean other actions then: the state with more trials is kept whole, frozen as it was here."""
+    mine, theirs = make("ucb1", ("pick_fast",)), state_of("ucb1", {"A": 3})
+    mine.update("B", "pick_fast", Observation(Status.SUCCESS, 1.0))
+    one, other = EstimatesFile(tmp_path / "one.db"), EstimatesFile(tmp_path / "other.db")
+    one.add(Estimates(), {"pick": {**mine.state(), "frozen": True}})
+    other.add(Estimates(), {"pick": theirs})
+    one.merge(other.path)
+    assert one.read().states("ucb1")["pick"] == {**theirs, "frozen": True}
+
+
+def test_a_copy_that_goes_on_is_somebody_else(tmp_path: Path) -> None:
+    """Copied to another machine by hand: what both learn afterwards counts, what they share counts once."""
+    one = file_of(tmp_path / "one.db", 10)
+    copy = EstimatesFile(Path(shutil.copy(one.path, tmp_path / "copy.db")))
+    one.add(gained(5, salt="one"), {})
+    copy.add(gained(3, salt="copy"), {})
+    copy.merge(one.path)
+    one.merge(copy.path)
+    one.merge(copy.path)
+    for file in (one, copy):
+        assert file.read().estimates.tally(KEY).runs == 18
+    renamed = EstimatesFile(one.path.rename(tmp_path / "renamed.db"))
+    origin = renamed.read().origin
+    renamed.add(gained(1, salt="later"), {})
+    assert renamed.read().origin == origin
+
+
+def test_a_file_that_was_only_begun_holds_nothing(tmp_path: Path) -> None:
+    """A kill between making the file and its first transaction leaves an empty one: it is used as if it were not there."""
+    path = tmp_path / "begun.db"
+    path.touch()
+    file = EstimatesFile(path)
+    assert file.read() == Kept()
+    assert file.records_of("m") == 0
+    whole = file_of(tmp_path / "whole.db", 2)
+    whole.merge(path)
+    assert whole.read().estimates.tally(KEY).runs == 2
+    file.add(gained(4), {})
+    assert file.read().estimates.tally(KEY).runs == 4
+
+
+def test_a_damaged_selector_is_not_taken_in(tmp_path: Path) -> None:
+    """One clear error, and the file that should have taken it is as it was."""
+    one, other = file_of(tmp_path / "one.db", 2), EstimatesFile(tmp_path / "other.db")
+    other.add(Estimates(), {"pick": state_of("ucb1", {"A": 3})})
+    for body in ("torn", "[]", '{"learners": {"A": {}}}'):
+        written(other.path, f"UPDATE selector SET state = '{body}'")
+        with pytest.raises(EstimatesError, match="do not fit"):
+            one.merge(other.path)
+    assert not one.read().selectors
+
+
+@pytest.mark.parametrize("selectors_only", [False, True])
+def test_a_choice_that_was_reset_does_not_come_back(tmp_path: Path, selectors_only: bool) -> None:
+    """Neither from an old copy of the file; what is learned after the reset stays."""
+    one = file_of(tmp_path / "one.db", 3)
+    one.add(Estimates(), {"pick": state_of("nikolic_fu", {"A": 50})})
+    copy = Path(shutil.copy(one.path, tmp_path / "copy.db"))
+    one.reset("pick", selectors_only=selectors_only)
+    one.merge(copy)
+    assert not one.read().selectors
+    afresh = state_of("nikolic_fu", {"A": 2})
+    one.add(Estimates(), {"pick": afresh})
+    one.merge(copy)
+    assert one.read().states("nikolic_fu")["pick"] == afresh
+    assert one.read().estimates.tally(KEY).runs == (3 if selectors_only else 0)
+
+
+def test_what_is_learned_after_another_files_reset_counts(tmp_path: Path) -> None:
+    """A file that hears of a reset of its own runs goes on under a new origin, so that the next merge does not drop them."""
+    one, other = file_of(tmp_path / "one.db", 5), file_of(tmp_path / "other.db", 4)
+    one.merge(other.path)
+    one.reset("pick")
+    other.merge(one.path)
+    assert not other.read().estimates.tallies
+    other.add(gained(2, salt="after"), {})
+    one.merge(other.path)
+    other.merge(one.path)
+    assert one.read().estimates.tally(KEY).runs == other.read().estimates.tally(KEY).runs == 2
 
 
 def test_what_was_reset_stays_forgotten(tmp_path: Path) -> None:

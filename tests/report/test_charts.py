@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 import re
+import sys
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
+import cv2
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coordinator.report import charts
+from coordinator.report import charts, colours, raster
 from coordinator.report.charts import Chart, Scale, limits
 
 NUMBERS = st.floats(-1e6, 1e6, allow_nan=False)
@@ -89,3 +93,78 @@ def test_shapes_differ_by_more_than_colour() -> None:
     assert len({charts.shape(0, 0, i, "").split(" ")[0] for i in range(2)}) == 2
     corners = {re.sub(r'fill="[^"]+"', "", charts.shape(0, 0, i, "")) for i in range(4)}
     assert len(corners) == 4
+
+
+def test_a_picture_of_its_own_has_the_days_colours() -> None:
+    """No variable of the page is left in a file that stands alone; what is no colour of ours is left as it is."""
+    svg = charts.points("t", "x", "y", {str(i): [((float(i), 1.0), "tip")] for i in range(9)})
+    assert {f"var(--{name})" for name in colours.SERIES} <= set(re.findall(r"var\(--[a-z0-9-]+\)", svg))
+    alone = colours.standalone(svg)
+    assert "var(" not in alone
+    assert all(colours.LIGHT[name] in alone for name in (*colours.SERIES, "ink", "soft", "line", "paper"))
+    assert (
+        colours.standalone("<svg fill='var(--mine)'/>")
+        == "<svg xmlns=\"http://www.w3.org/2000/svg\" fill='var(--mine)'/>"
+    )
+
+
+def _luminance(colour: str) -> float:
+    """Relative luminance (WCAG 2.2)."""
+    parts = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in parts]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+def contrast(one: str, other: str) -> float:
+    """Contrast ratio (WCAG 2.2), 1 to 21."""
+    low, high = sorted((_luminance(one), _luminance(other)))
+    return (high + 0.05) / (low + 0.05)
+
+
+@pytest.mark.parametrize("scheme", [colours.LIGHT, colours.DARK], ids=["day", "night"])
+def test_words_and_marks_stand_out(scheme: dict[str, str]) -> None:
+    """WCAG 2.2 level AA on paper and panel: 4.5 for words; night's marks 3, day's as Okabe and Ito chose them."""
+    for ground in (scheme["paper"], scheme["panel"]):
+        assert all(contrast(scheme[name], ground) >= 4.5 for name in ("ink", "soft"))
+        if scheme is colours.DARK:
+            assert all(
+                contrast(scheme[name], ground) >= 3.0 for name in (*colours.SERIES, "success", "failure", "error")
+            )
+    assert colours.LIGHT.keys() == colours.DARK.keys()
+
+
+def test_a_picture_becomes_a_png_with_its_words() -> None:
+    """Twice the size, on white, and the title is drawn: the bytes are decoded again."""
+    pytest.importorskip("resvg_py", reason="the extra `png` (resvg-py) is not installed")
+    image = cv2.imdecode(
+        np.frombuffer(raster.png(colours.standalone(charts.lines("Title", "x", "y", {}))), np.uint8), 1
+    )
+    bare = cv2.imdecode(np.frombuffer(raster.png(colours.standalone(charts.lines("", "x", "y", {}))), np.uint8), 1)
+    assert image is not None and bare is not None and image.shape == (640, 1280, 3)
+    assert image[0, 0].tolist() == [255, 255, 255] and image.min() < 60
+    rows, columns = np.nonzero(np.any(image != bare, axis=2))
+    assert len(rows) > 100 and rows.max() < 60 and columns.min() > 100
+    with pytest.raises(raster.RasterError, match="no SVG"):
+        raster.png("<svg")
+
+
+def test_without_resvg_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One line, and no picture."""
+    monkeypatch.setitem(sys.modules, "resvg_py", None)
+    raster.unavailable.cache_clear()
+    try:
+        with pytest.raises(raster.RasterError, match=r"petrobot\[png\]"):
+            raster.png("<svg/>")
+    finally:
+        raster.unavailable.cache_clear()
+
+
+def test_a_host_without_fonts_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Words would be missing: pictures without words are not made."""
+    blank = SimpleNamespace(svg_to_bytes=lambda **_: b"the same picture")
+    monkeypatch.setitem(sys.modules, "resvg_py", blank)
+    raster.unavailable.cache_clear()
+    try:
+        assert "no fonts" in raster.unavailable()
+    finally:
+        raster.unavailable.cache_clear()

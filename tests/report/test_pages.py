@@ -274,5 +274,42 @@ def test_report_of_a_recorded_run(
     (folder / RESULT).write_text(json.dumps(mission.result("lockstep", 1.0)), encoding="utf-8")
     assert main(["report", str(folder), "--out", str(tmp_path / "again.html")]) == 0
     assert "Where parts lay" in (tmp_path / "again.html").read_text(encoding="utf-8")
-    assert {p.stem for p in (tmp_path / "again_pictures").glob("*.svg")} == {"gantt", "own_1"}
+    drawn = {p.stem for p in (tmp_path / "again_pictures").glob("*.svg")}
+    actions = {f"{what}_{task}" for what in ("reliability", "cost") for task in ("look", "grip", "mend")}
+    objectives = {f"objective_{task}__rough" for task in ("look", "grip")}
+    assert drawn == {"gantt", "net", "own_1", "latencies"} | objectives | actions
     capsys.readouterr()
+
+
+def test_report_of_a_run_that_learned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The learned probabilities of each trial, as `run` learned them; without its estimates file the rest is still drawn."""
+    monkeypatch.syspath_prepend(str(HERE))
+    learned, journals = tmp_path / "learned.db", tmp_path / "runs"
+    told = [
+        "run",
+        str(TASK),
+        "--services",
+        str(SERVICES),
+        "--mode",
+        "lockstep",
+        "--runs",
+        "12",
+        "--seed",
+        "3",
+        "--quiet",
+    ]
+    assert main([*told, "--regime", "rough", "--learn", str(learned), "--journal", str(journals)]) == 0
+    (folder,) = journals.iterdir()
+    assert main(["report", str(folder)]) == 0
+    picture = (folder / "report_pictures" / "probability_look__rough.svg").read_text(encoding="utf-8")
+    ElementTree.fromstring(picture)
+    result = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+    assert all(action in picture for action in result["learned"]["probabilities"]["look"])
+    learned.write_bytes(b"no database at all, but long enough to be looked at" * 9)
+    capsys.readouterr()
+    assert main(["report", str(folder), "--out", str(tmp_path / "later.html")]) == 0
+    assert "no learned probabilities" in capsys.readouterr().err
+    assert not (tmp_path / "later_pictures" / "probability_look__rough.svg").exists()
+    assert (tmp_path / "later_pictures" / "reliability_look.svg").exists()
