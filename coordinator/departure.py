@@ -10,12 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from coordinator.engine import Engine, Mode, Phase, Point, Run, Standing, State, point_from_plain, to_plain
-from coordinator.journal import Journal
-from coordinator.recording import STIMULUS, replay
-from coordinator.task import Kind, Status
+from coordinator.journal import Journal, JournalWriter
+from coordinator.launch import Setting, lockstep_id
+from coordinator.learning_session import fixed_by_user, session_of
+from coordinator.partners import FirstAlternative, Observer
+from coordinator.recording import STIMULUS, JournalStore, clock_reading, replay
+from coordinator.runfolder import JOURNAL, header
+from coordinator.task import Kind, Status, Task
 
 AGAIN = "again"
 """A run that went on begins anew."""
@@ -69,10 +74,64 @@ def departure(
     return Departure(run, record, time, words, point_of(engine, state, words))
 
 
-def departed(header: Mapping[str, Any]) -> Point | None:
-    """The point at which a recorded run set out; None if at the task's own beginning."""
-    plain = header.get("from", {}).get("point")
+def departed(then: Mapping[str, Any]) -> Point | None:
+    """The point at which a run set out, from its journal's header; None if at the task's own beginning."""
+    plain = then.get("from", {}).get("point")
     return None if plain is None else point_from_plain(plain)
+
+
+def departing(
+    journal: Journal,
+    task: Task,
+    engine: Engine,
+    departure: Departure,
+    seed: int | None = None,
+    parameters: Mapping[str, Any] | None = None,
+) -> Setting:
+    """The setting of the new run: that of the recorded one, but for a `seed` and `parameters` that are given.
+
+    Who chooses is as at that moment: a selector that learned is brought there, and what it learns from here on is not kept.
+    Raises ValueError, EstimatesError.
+    """
+    then = journal.header
+    session = session_of(task, then)
+    if session is not None:
+        _bring(session.selector, journal, engine, departure.record)
+    selector = FirstAlternative(fixed_by_user(then)) if session is None else session.selector
+    given = {**then["parameters"], **(parameters or {})}
+    return Setting(task, given, then["runs"], then["seed"] if seed is None else seed, selector, departure.point)
+
+
+def _bring(selector: Observer, journal: Journal, engine: Engine, record: int) -> None:
+    for step in replay(journal, engine):
+        if step.number > record:
+            return
+        selector.stimulus(step.time, step.stimulus)
+        for instruction in step.instructions:
+            selector.instruction(step.time, instruction)
+        selector.settled(step.time, step.state)
+
+
+def departed_store(
+    journal: Journal, setting: Setting, departure: Departure, folder: Path, more: Mapping[str, Any] | None = None
+) -> JournalStore:
+    """The new run's journal in its own folder; its header says from which run and record it came. Raises JournalError."""
+    then = journal.header
+    given: dict[str, Any] = {
+        "services_path": then["services_path"],
+        "seed": setting.seed,
+        "runs": setting.runs,
+        "parameters": {**setting.task.parameters, **setting.parameters},
+        "clock": clock_reading(0.0),
+        "durable": False,
+        "mock": then.get("mock", ""),
+        "cell": "launched",
+        "chosen": dict(then.get("chosen", {})),
+        "from": departure.plain(),
+        **(more or {}),
+    }
+    first = header(lockstep_id(setting), then["task"], then["services"], "lockstep", given)
+    return JournalStore(JournalWriter(folder / JOURNAL, first), 0.0, durable=bool(given["durable"]))
 
 
 def point_of(engine: Engine, state: State, words: Mapping[str, str]) -> Point:

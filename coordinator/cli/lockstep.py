@@ -77,13 +77,15 @@ def in_one_process(
 def retrace(found: Recorded, selector: Selector, watch: Watch | None) -> tuple[Mission, Timeline]:
     """Go on with a run whose cell ended with its coordinator: made again from its seed, compared with the journal as far as that
     goes, and written on from there."""
+    from coordinator.departure import departed
     from coordinator.journal import JournalWriter
     from coordinator.launch import Setting
     from coordinator.recording import RetracingStore
 
     header = found.journal.header
     store = RetracingStore(JournalWriter(found.journal.path), found.journal)
-    setting = Setting(found.task, header["parameters"], header["runs"], header["seed"], selector)
+    given = header["parameters"], header["runs"], header["seed"]
+    setting = Setting(found.task, *given, selector, departed(header))
     mock = Path(header["mock"]) if header.get("mock") else None
     return in_one_process(found.directory, setting, substitutes(mock, found.directory), watch, store)
 

@@ -74,7 +74,7 @@ def _text(found: Recorded) -> Iterator[str]:
         yield f"(a torn tail of {found.journal.torn_bytes} bytes was dropped)"
     for step in found.steps():
         for one in step.instructions:
-            when = f"{step.time:10.3f} s  "
+            when = f"{step.number:5} {step.time:10.3f} s  "
             if isinstance(one, Fired):
                 yield f"{when}fired    {one.transition:20} {net.describe(one.after)}"
             elif isinstance(one, StartRun):

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
+from coordinator.cli.departing import add_departing_arguments, depart
 from coordinator.cli.journaling import add_journal_arguments, journal_folder, new_store, tidy
 from coordinator.cli.learning import add_learning_arguments, opened, saved
 from coordinator.cli.loading import (
@@ -23,6 +24,7 @@ from coordinator.cli.loading import (
     pictures_of,
     write_json,
 )
+from coordinator.cli.parameters import parameter_of
 
 if TYPE_CHECKING:
     from coordinator.launch import Setting
@@ -32,18 +34,24 @@ if TYPE_CHECKING:
     from coordinator.timeline import Timeline
     from services.comm.directory import Directory
 
+MODES = ("realtime", "lockstep")
+SEED = 1
 EXAMPLE = "petrobot run catch_ball --mode lockstep --runs 20 --seed 1 --json out.json"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
-    parser.add_argument("task", help="a task file, or the name of a task that comes with petrobot")
+    parser.add_argument(
+        "task",
+        nargs="?",
+        help="a task file, or the name of a task that comes with petrobot (with --from: that of the run)",
+    )
     parser.add_argument(
         "--runs", type=_positive, metavar="N", help="how many runs (default: tokens in the task's runs place)"
     )
-    parser.add_argument("--mode", choices=("realtime", "lockstep"), default="realtime", help="default: %(default)s")
+    parser.add_argument("--mode", choices=MODES, help=f"default: {MODES[0]}, with --from {MODES[1]}")
     parser.add_argument(
-        "--seed", type=int, default=1, metavar="S", help="of all chance in the run (default: %(default)s)"
+        "--seed", type=int, metavar="S", help=f"of all chance in the run (default: {SEED}, with --from that of the run)"
     )
     parser.add_argument("--regime", metavar="NAME", help="the same as --set regime=NAME")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the task")
@@ -63,6 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--mock", metavar="FILE", type=Path, help="replace actions by scripted ones")
     add_learning_arguments(parser)
+    add_departing_arguments(parser)
     parser.add_argument("--json", metavar="FILE", help="write the result as JSON (- for standard output)")
     parser.add_argument("--report", metavar="FOLDER", type=Path, help="leave a report in this folder")
     add_journal_arguments(parser)
@@ -89,6 +98,13 @@ def run(options: argparse.Namespace) -> int:
     from coordinator.mission import MissionError
     from services.comm.directory import DirectoryError
 
+    if options.departs is not None:
+        return depart(options)
+    if options.task is None:
+        raise CommandError(2, "give a task, or with --from a recorded run")
+    if options.going:
+        raise CommandError(2, "--going goes with --from")
+    options.mode, options.seed = options.mode or MODES[0], SEED if options.seed is None else options.seed
     task = load_task(options.task)
     options.services = cell_path(options.services, options.task, task)
     directory = load_directory(options.services)
@@ -138,11 +154,11 @@ def _setting(task: Task, directory: Directory, options: argparse.Namespace) -> S
     from coordinator.launch import Setting
     from coordinator.partners import FirstAlternative
 
-    given = dict(_pairs("--set", options.set))
+    given = dict(pairs("--set", options.set))
     if options.regime is not None:
         given["regime"] = options.regime
-    parameters = {name: _parameter(task, name, text) for name, text in given.items()}
-    chosen = dict(_pairs("--use", options.use))
+    parameters = {name: parameter_of(task, name, text) for name, text in given.items()}
+    chosen = dict(pairs("--use", options.use))
     for primitive, action in chosen.items():
         known = task.primitive_tasks.get(primitive)
         if known is None or action not in known.alternatives:
@@ -157,27 +173,13 @@ def _setting(task: Task, directory: Directory, options: argparse.Namespace) -> S
     return Setting(task, parameters, options.runs, options.seed, selector)
 
 
-def _pairs(option: str, texts: list[str]) -> Iterator[tuple[str, str]]:
+def pairs(option: str, texts: list[str]) -> Iterator[tuple[str, str]]:
+    """NAME=VALUE as users write it. Raises CommandError."""
     for text in texts:
         name, equals, value = text.partition("=")
         if not equals:
             raise CommandError(2, f"{option} {text}: write NAME=VALUE")
         yield name, value
-
-
-def _parameter(task: Task, name: str, text: str) -> Any:
-    if name not in task.parameters:
-        known = ", ".join(task.parameters) or "none"
-        raise CommandError(2, f"{task.name} has no parameter {name!r}; it has: {known}")
-    default = task.parameters[name]
-    if isinstance(default, bool):
-        if text not in ("true", "false"):
-            raise CommandError(2, f"parameter {name}: {text!r} is neither true nor false")
-        return text == "true"
-    try:
-        return type(default)(text) if isinstance(default, int | float) else text
-    except ValueError as fault:
-        raise CommandError(2, f"parameter {name}: {text!r} is no {type(default).__name__}") from fault
 
 
 # --- lock step ---------------------------------------------------------------------------------------------------------
