@@ -167,7 +167,8 @@ class Callee:
         """
         offer = self.offers.get(call.service)
         id_ = call.id
-        if offer is None or offer.inline is None or id_ in self._results or id_ in self._running:
+        results = self._results
+        if offer is None or offer.inline is None or id_ in results.kept or id_ in results.gone or id_ in self._running:
             return None
         if call.boot and call.boot != self.boot:
             return None
@@ -175,9 +176,12 @@ class Callee:
             return None
         return self._answered(now, offer.inline, call)
 
-    def keep(self, now: float, peer: str, outcome: Outcome) -> None:
-        """What `answer_inline` gave is on its way: keep it until it is acknowledged, as every result."""
-        self._results.add(now, peer, outcome)
+    def keep(self, now: float, peer: str, outcome: Outcome, weight: int | None = None) -> None:
+        """What `answer_inline` gave is on its way: keep it until it is acknowledged, as every result.
+
+        `weight` is its length on the wire (bytes), None where it is not known.
+        """
+        self._results.add(now, peer, outcome, weight)
         due = now + self._keeping.results
         if due < self.soonest:
             self.soonest = due
@@ -225,8 +229,7 @@ class Callee:
         self._orders.append(StartRun(call, peer))
 
     def _take_ack(self, now: float, peer: str, ack: ResultAck) -> None:
-        for id_ in (ack.id, *ack.more):
-            self._results.acknowledge(now, peer, id_)
+        self._results.acknowledge(now, peer, (ack.id, *ack.more))
 
     def _take_cancel(self, now: float, peer: str, cancel: Cancel) -> None:
         run = self._running.get(cancel.id)

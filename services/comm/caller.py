@@ -20,7 +20,7 @@ from services.comm.events import EventIntake
 from services.comm.notice import Accepted, Answered, Ended, EventArrived, Late, Notice, PeerBack, PeerLost, Progress
 from services.comm.plain import plain
 from services.comm.settled import Settled
-from services.comm.under_way import NEVER, Patience, Pending, UnderWay
+from services.comm.under_way import NEVER, Patience, Pending, UnderWay, Waiter
 
 __all__ = ["Accepted", "Answered", "Caller", "Ended", "EventArrived", "Late", "Notice", "Patience", "PeerBack"]
 __all__ += ["PeerLost", "Progress"]
@@ -93,9 +93,9 @@ class Caller:
         seed: int = 0,
         epoch: int = 0,
         boot: str = "",
-        done: Callable[[m.Outcome], None] | None = None,
+        waiter: Waiter | None = None,
     ) -> int:
-        """`call` by the fields of a Call. `done` is told its end in place of a notice, and its result acknowledged then.
+        """`call` by the fields of a Call. `waiter` is told its end in place of a notice, and its result acknowledged then.
 
         Gives how many messages wait to be taken out.
         """
@@ -104,7 +104,7 @@ class Caller:
         if arguments:
             arguments = plain(arguments, "arguments")
         call = m.Call(id, service, arguments, deadline, epoch or self.hello.epoch, boot or self.boot, parent, seed)
-        pending = self._pending[id] = Pending(call, not boot, now, done)
+        pending = self._pending[id] = Pending(call, not boot, now, waiter)
         if self.up:
             self._send(now, pending)
         elif self._refusal:
@@ -248,18 +248,25 @@ class Caller:
     def take_outcomes(self, now: float, outcomes: Iterable[m.Outcome]) -> None:
         """`receive` of results."""
         safe: list[str] = []
+        take = self._pending.pop
         for outcome in outcomes:
             id_ = outcome.id
-            pending = self._pending.pop(id_, None)
+            pending = take(id_, None)
             if pending is None:
                 if id_ not in safe:
                     self._take_late(now, outcome)
                 continue
-            if pending.done is not None or self._auto_ack:
+            waiter = pending.waiter
+            if waiter is not None:
+                safe.append(id_)
+                if not waiter.done():
+                    waiter.set_result(outcome)
+                continue
+            if self._auto_ack:
                 safe.append(id_)
             else:
                 self._settled.end(id_, False)
-            self._tell_end(pending, outcome)
+            self._notices.append(Ended(outcome))
         if safe:
             self._ack(now, *safe)
 
@@ -385,10 +392,11 @@ class Caller:
         self._tell_end(pending, m.Outcome(id_, ERROR, {}, cause, text, executed))
 
     def _tell_end(self, pending: Pending, outcome: m.Outcome) -> None:
-        if pending.done is not None:
-            pending.done(outcome)
-        else:
+        waiter = pending.waiter
+        if waiter is None:
             self._notices.append(Ended(outcome))
+        elif not waiter.done():
+            waiter.set_result(outcome)
 
     def _no_answer(self, id_: str, cause: str) -> None:
         self._commands.pop(id_, None)

@@ -26,6 +26,7 @@ OnNotices = Callable[[float, list[Notice]], None]
 NOT_TRUSTED = "perhaps our certificate is not trusted there: it takes TLS 1.3 and certificates of its own cell alone"
 _NUMBERS = itertools.count(1)
 """Of calls: of all clients of this process, which may have one name and boot among them."""
+_OUTCOMES = frozenset((Outcome,))
 _NO_ARGUMENTS: Mapping[str, Any] = {}
 AT_ONCE = 16
 """Calls that share one write: the peer takes them in while the next ones are made."""
@@ -46,9 +47,9 @@ class _ClientLink(Link):
 
     def took(self, now: float, messages: list[Message]) -> None:
         client = self._client
-        if type(messages[0]) is Outcome and all(type(message) is Outcome for message in messages):
-            client.caller.take_outcomes(now, cast("list[Outcome]", messages))
-            messages = []
+        if _OUTCOMES.issuperset(map(type, messages)):
+            client.took_outcomes(now, cast("list[Outcome]", messages))
+            return
         for message in messages:
             if isinstance(message, Welcome):
                 self.welcome = True
@@ -73,23 +74,6 @@ class _ClientLink(Link):
     def over(self, now: float) -> None:
         self.finished.set()
         self._client.gone(now, self)
-
-
-class _Asked(asyncio.Future[Outcome]):
-    """Outcome of a call made by `Client.call`."""
-
-    asked: tuple[Client, str]
-
-    def end(self, outcome: Outcome) -> None:
-        if not self.done():
-            self.set_result(outcome)
-
-    def cancel(self, msg: Any = None) -> bool:
-        cancelled = super().cancel(msg)
-        if cancelled:
-            client, id_ = self.asked
-            client.give_up(id_)
-        return cancelled
 
 
 class Client:
@@ -161,7 +145,7 @@ class Client:
 
     # Calls.
 
-    def call(
+    async def call(
         self,
         service: str,
         arguments: Mapping[str, Any] = _NO_ARGUMENTS,
@@ -169,26 +153,33 @@ class Client:
         deadline: float | None = None,
         parent: str = "",
         seed: int = 0,
-    ) -> asyncio.Future[Outcome]:
-        """Call a service: a future of its outcome, which is acknowledged when it comes. Cancelling it cancels the call."""
+    ) -> Outcome:
+        """Call a service: its outcome, which is acknowledged when it comes. Cancelling the task cancels the call."""
         id_ = f"{self._prefix}{next(_NUMBERS)}"
         now = self.now()
-        future = _Asked(loop=self.loop)
-        future.asked = self, id_
+        future: asyncio.Future[Outcome] = self._loop.create_future()
         caller = self.caller
-        waiting = caller.begin(now, id_, service, arguments, deadline, parent, seed, done=future.end)
-        if waiting >= AT_ONCE or caller.calls == 1:
+        waiting = caller.begin(now, id_, service, arguments, deadline, parent, seed, waiter=future)
+        if waiting >= AT_ONCE or (caller.calls == 1 and not self._flushing):
             self.flush(now)
         elif not self._flushing:
-            # Others are under way: let those that are made in this turn of the loop share a write.
-            self._flushing = True
-            self._loop.call_soon(self._flush_soon)
-        return future
+            self._flush_in_a_moment()
+        try:
+            return await future
+        except asyncio.CancelledError:
+            self.give_up(id_)
+            raise
 
     def give_up(self, id_: str) -> None:
-        """The future of this call was cancelled."""
+        """Nobody waits for this call any more."""
         self.caller.cancel(self.now(), id_, "its caller gave up")
         self.flush()
+
+    def _flush_in_a_moment(self) -> None:
+        """What is called in this turn of the loop shares a write."""
+        if not self._flushing:
+            self._flushing = True
+            self._loop.call_soon(self._flush_soon)
 
     def _flush_soon(self) -> None:
         self._flushing = False
@@ -257,6 +248,14 @@ class Client:
         self.trouble = ""
         self._link = link
         return link
+
+    def took_outcomes(self, now: float, outcomes: list[Outcome]) -> None:
+        """Calls have ended. Their owners go on in this turn of the loop: what they call now shares a write."""
+        self.caller.take_outcomes(now, outcomes)
+        if len(outcomes) > 1 and not self.caller.has_news:
+            self._flush_in_a_moment()
+        else:
+            self.flush(now)
 
     def welcomed(self, now: float, link: _ClientLink, welcome: Welcome) -> None:
         """A link was welcomed."""

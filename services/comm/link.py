@@ -116,6 +116,8 @@ class Link(asyncio.BufferedProtocol):
         """Why the link is over."""
         self.silent = False
         """Whether it is over because the other side was silent."""
+        self.frames: list[bytes] = []
+        """Made by the connection and not yet written: they have their places in the order, so they go before all else."""
         self._view = memoryview(buffer)
         self._transport: asyncio.Transport | None = None
         self._heart = Heart(0.0, timing)
@@ -223,19 +225,35 @@ class Link(asyncio.BufferedProtocol):
 
     def send(self, messages: Sequence[Message]) -> None:
         """Send messages in one write. One that no frame can carry is answered for by `unsendable`."""
+        if self.frames:
+            self.write()
         transport = self._transport
         if transport is None or transport.is_closing():
             return
         transport.write(self._all_bytes(messages))
-        if self.slow and transport.get_write_buffer_size() > self.limits.buffer_hard:
-            self.cut(f"it does not read: {self.limits.buffer_hard} bytes wait for it")
+        if self.slow:
+            self._bear(transport)
 
     def send_one(self, message: Message) -> None:
         """Send one message."""
-        if self.slow or self._transport is None or self._transport.is_closing():
+        if self.slow or self.frames or self._transport is None or self._transport.is_closing():
             self.send((message,))
             return
         self._transport.write(self._bytes(message))
+
+    def write(self) -> None:
+        """Send the frames that wait, in one write."""
+        frames, self.frames = self.frames, []
+        transport = self._transport
+        if transport is None or transport.is_closing():
+            return
+        transport.write(frames[0] if len(frames) == 1 else b"".join(frames))
+        if self.slow:
+            self._bear(transport)
+
+    def _bear(self, transport: asyncio.Transport) -> None:
+        if transport.get_write_buffer_size() > self.limits.buffer_hard:
+            self.cut(f"it does not read: {self.limits.buffer_hard} bytes wait for it")
 
     def _all_bytes(self, messages: Sequence[Message]) -> bytes:
         if not self.slow and not self._opening:
@@ -260,6 +278,8 @@ class Link(asyncio.BufferedProtocol):
         if transport is None:
             return
         self.reason = self.reason or reason
+        if self.frames:
+            self.write()
         if last is not None and not transport.is_closing():
             with contextlib.suppress(ProtocolError):
                 transport.write(self.connection.send(last))

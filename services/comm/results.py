@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from types import NoneType
 from typing import Any
@@ -65,19 +65,26 @@ class ResultStore:
         self._ids_due = math.inf
         """Not later than when the oldest id has been remembered long enough (s)."""
 
+        self.kept: Collection[str] = self._results.keys()
+        """Ids whose result is kept,"""
+        self.gone: Collection[str] = self._ids.keys()
+        """and those whose result is gone; both for quick looks, see `in`."""
+
     def __contains__(self, id_: str) -> bool:
         return id_ in self._ids or id_ in self._results
 
-    def add(self, now: float, peer: str, outcome: Outcome) -> None:
-        """Keep a result for its caller."""
-        weight = weight_of(outcome.values) if outcome.values else 0
-        older = self._results.get(outcome.id)
-        self._weight += weight - (older[3] if older is not None else 0)
-        self._results[outcome.id] = (outcome, peer, now, weight)
-        while len(self._results) > self._keeping.result_count or (
-            self._weight > self._keeping.result_bytes and len(self._results) > 1
+    def add(self, now: float, peer: str, outcome: Outcome, weight: int | None = None) -> None:
+        """Keep a result for its caller. `weight` is its length on the wire (bytes) where that is known, else it is estimated."""
+        if weight is None:
+            weight = weight_of(outcome.values) if outcome.values else 0
+        results, id_ = self._results, outcome.id
+        older = results.get(id_)
+        self._weight += weight if older is None else weight - older[3]
+        results[id_] = (outcome, peer, now, weight)
+        while len(results) > self._keeping.result_count or (
+            self._weight > self._keeping.result_bytes and len(results) > 1
         ):
-            self._forget(now, next(iter(self._results)))
+            self._forget(now, next(iter(results)))
 
     def get(self, id_: str) -> Outcome | None:
         """The result of this call, None if it is not kept (any more)."""
@@ -89,11 +96,13 @@ class ResultStore:
         stored = self._results.get(id_)
         return "" if stored is None else stored[1]
 
-    def acknowledge(self, now: float, peer: str, id_: str) -> None:
-        """The caller has this result safe; of others' ids nothing is forgotten."""
-        stored = self._results.get(id_)
-        if stored is not None and stored[1] == peer:
-            self._forget(now, id_)
+    def acknowledge(self, now: float, peer: str, ids: Iterable[str]) -> None:
+        """The caller has these results safe; of others' ids nothing is forgotten."""
+        get = self._results.get
+        for id_ in ids:
+            stored = get(id_)
+            if stored is not None and stored[1] == peer:
+                self._forget(now, id_)
 
     def of(self, peer: str) -> list[str]:
         """Ids of the results kept for this caller."""

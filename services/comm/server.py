@@ -57,29 +57,36 @@ class _ServerLink(Link):
         self._taken += len(messages)
         if self._taken >= COUNTED and not self._in_time(now):
             return
-        answers: list[Message] = []
+        at_once = min(len(messages), AT_ONCE)
         for message in messages:
             if type(message) is Call and peer and (answer := callee.answer_inline(now, peer, message)) is not None:
                 # The shortest way for what is answered on the spot; the caller reads while its answer is being kept here.
-                if len(messages) == 1:
-                    self.send_one(answer)
-                else:
-                    answers.append(answer)
-                    if len(answers) == AT_ONCE:
-                        self.send(answers)
-                        answers = []
-                callee.keep(now, peer, answer)
+                answer, frame = self._framed(answer)
+                self.frames.append(frame)
+                if len(self.frames) >= at_once:
+                    self.write()
+                callee.keep(now, peer, answer, len(frame))
             elif isinstance(message, Hello):
                 self._greet(now, message)
                 peer = self.peer
             elif peer:
                 callee.receive(now, peer, message)
-        if answers:
-            self.send(answers)
+        if self.frames:
+            self.write()
         if callee.has_work:
             self._server.flush(now)
         else:
             self._server.arm()
+
+    def _framed(self, answer: Outcome) -> tuple[Outcome, bytes]:
+        """A result and its frame; where no frame can carry it, what is answered in its place, which is then what is kept."""
+        try:
+            return answer, self.connection.send(answer)
+        except ProtocolError as fault:
+            answer = _bad_result(answer, fault)
+            # Its last word may have come with the call: then nobody listens any more.
+            frame = self.connection.send(answer) if self.connection.state is State.OPEN else b""
+            return answer, frame
 
     def beaten(self, now: float, count: int) -> bool:
         self._taken += count
@@ -134,8 +141,7 @@ class _ServerLink(Link):
 
     def unsendable(self, message: Message, fault: ProtocolError) -> Message | None:
         if isinstance(message, Outcome):
-            text = f"its result cannot be sent: {fault.text}"
-            return Outcome(message.id, "error", {}, "bad_result", text, message.executed, message.seconds)
+            return _bad_result(message, fault)
         if isinstance(message, Answer):
             return Answer(message.id, False, {"cause": fault.code, "text": fault.text})
         return None
@@ -145,6 +151,11 @@ class _ServerLink(Link):
 
     def over(self, now: float) -> None:
         self._server.gone(self, now)
+
+
+def _bad_result(outcome: Outcome, fault: ProtocolError) -> Outcome:
+    text = f"its result cannot be sent: {fault.text}"
+    return Outcome(outcome.id, "error", {}, "bad_result", text, outcome.executed, outcome.seconds)
 
 
 class Server:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol
 
 from services.comm.messages import Call, Executed, Outcome
 
@@ -30,6 +30,16 @@ class Patience:
     """How long an acknowledgement waits for others to go with it."""
 
 
+class Waiter(Protocol):
+    """Whoever waits for one call's end; a future of asyncio is one."""
+
+    def done(self) -> bool:
+        """Whether it wants to know no more."""
+
+    def set_result(self, outcome: Outcome, /) -> None:
+        """The call has ended so."""
+
+
 @dataclass(slots=True)
 class Pending:
     """A call that has not ended. `made` and the dues are on the caller's clock (s)."""
@@ -38,7 +48,7 @@ class Pending:
     any_boot: bool
     """Until it is sent, it may go to whatever boot the peer is; False when its owner names one."""
     made: float
-    done: Callable[[Outcome], None] | None = None
+    waiter: Waiter | None = None
     """Told its end in place of a notice; the result is acknowledged then."""
     sent: bool = False
     accepted: bool = False

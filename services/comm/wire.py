@@ -105,14 +105,14 @@ class Connection:
 
     def send_all(self, messages: Sequence[Message]) -> bytes:
         """Bytes of messages that may all go and end nothing. Raises as `send`; then nothing has changed."""
-        if any(message.KIND not in self._quick_out for message in messages):
+        if not self._quick_out.issuperset([message.KIND for message in messages]):
             raise ProtocolError("out_of_turn", "these messages have to be sent one by one")
         parts: list[bytes] = []
-        for body in [encode(message) for message in messages]:
-            parts.append((len(body) + self._seal_bytes).to_bytes(_HEADER, "big"))
-            parts.append(body)
-            if self._seal_out is not None:
-                parts.append(self._seal_out.next(body))
+        seal, seal_bytes = self._seal_out, self._seal_bytes
+        for body in list(map(encode, messages)):
+            parts += (len(body) + seal_bytes).to_bytes(_HEADER, "big"), body
+            if seal is not None:
+                parts.append(seal.next(body))
         return b"".join(parts)
 
     def _send_unusual(self, message: Message) -> bytes:

@@ -21,6 +21,21 @@ from services.comm.codec import LIMITS, encode
 from services.comm.messages import Executed
 from services.comm.plain import NotPlainError
 
+
+class _Waiter:
+    """Who waits for the end of a call."""
+
+    def __init__(self, enough: bool = False) -> None:
+        self.enough = enough
+        self.told: list[m.Outcome] = []
+
+    def done(self) -> bool:
+        return self.enough
+
+    def set_result(self, outcome: m.Outcome, /) -> None:
+        self.told.append(outcome)
+
+
 HELLO = m.Hello(1, 1, "coordinator", "coord", "c1", 3)
 CALL = m.Call("1", "move", {"to": (1, 2)}, 2.0)
 
@@ -198,24 +213,38 @@ def test_a_cancelled_call_that_never_ends_is_given_up() -> None:
 
 def test_quick_calls_leave_nothing_behind() -> None:
     caller = _caller()
-    caller.begin(0.0, "first", "get", {}, done=lambda outcome: None)
+    caller.begin(0.0, "first", "get", {}, waiter=_Waiter())
     caller.take_outcomes(0.0, [m.Outcome("first", "success")])
     for n in range(5_000):
-        caller.begin(0.0, str(n), "get", {}, done=lambda outcome: None)
+        caller.begin(0.0, str(n), "get", {}, waiter=_Waiter())
         caller.take_outcomes(0.0, [m.Outcome(str(n), "success")])
     assert len(caller._pending) == 0 and len(caller._pending._accepts) < 500
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_who_waits_no_more_is_told_nothing_and_the_result_is_acknowledged_all_the_same(lost: bool) -> None:
+    caller, waiter = _caller(), _Waiter(enough=True)
+    caller.begin(0.0, "1", "get", {}, waiter=waiter)
+    if lost:
+        caller.link_refused(0.1, m.Refuse("directory", "other"))
+    else:
+        caller.messages(0.0)
+        caller.take_outcomes(0.1, [m.Outcome("1", "success")])
+        assert m.ResultAck("1") in caller.messages(1.0)
+    assert waiter.told == [] and caller.calls == 0
+    assert not any(isinstance(notice, Ended) for notice in caller.notices())
 
 
 def test_very_many_results_at_once_are_acknowledged_in_messages_that_may_be_sent() -> None:
     caller = _caller()
     ids = [f"{n:0255}" for n in range(1_000)]
-    ended: list[str] = []
+    waiter = _Waiter()
     for id_ in ids:
-        caller.begin(0.0, id_, "get", {}, done=lambda outcome: ended.append(outcome.id))
+        caller.begin(0.0, id_, "get", {}, waiter=waiter)
     caller.messages(0.0)
     caller.take_outcomes(0.1, [m.Outcome(id_, "success") for id_ in (*ids, ids[0])])
     acks = [message for message in caller.messages(0.1) if isinstance(message, m.ResultAck)]
-    assert ended == ids, "each once, also one that came twice"
+    assert [outcome.id for outcome in waiter.told] == ids, "each once, also one that came twice"
     assert [id_ for ack in acks for id_ in (ack.id, *ack.more)] == ids
     assert all(len(encode(ack)) <= LIMITS[m.ResultAck.KIND] for ack in acks)
 
