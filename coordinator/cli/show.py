@@ -20,6 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument("task", help="a task file, or the name of a task that comes with petrobot")
     parser.add_argument("--errors", action="store_true", help="draw the error branches too")
+    parser.add_argument("--inside", metavar="MACRO", default="", help="draw what is inside a macro place")
     parser.add_argument("--graph", action="store_true", help="draw the reachability graph instead (of any net file)")
     parser.add_argument("--heat", action="store_true", help="colour the action places by their share of the mean time")
     parser.add_argument("--out", metavar="FILE", default="-", help="where to write the SVG (default: standard output)")
@@ -27,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Draw."""
-    svg = _graph(options.task) if options.graph else _net(options.task, errors=options.errors, heat=options.heat)
+    svg = _graph(options.task) if options.graph else _net(options)
     if options.out == "-":
         print(svg)
         return 0
@@ -38,11 +39,15 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _net(name: str, *, errors: bool, heat: bool) -> str:
+def _net(options: argparse.Namespace) -> str:
     from coordinator.drawing import draw
 
-    task = load_task(name)
-    return draw(task, error_branches=errors, overlay=_heat(task) if heat else None)
+    task = load_task(options.task)
+    overlay = _heat(task) if options.heat else None
+    try:
+        return draw(task, error_branches=options.errors, overlay=overlay, inside=options.inside)
+    except ValueError as fault:
+        raise CommandError(2, str(fault)) from fault
 
 
 def _heat(task: Task) -> Overlay:

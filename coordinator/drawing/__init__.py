@@ -17,16 +17,18 @@ def draw(
     marking: Marking | None = None,
     title: str | None = None,
     overlay: Overlay | None = None,
+    inside: str = "",
 ) -> str:
     """SVG of the model.
 
     A task is drawn as its file has it: macro places stay folded, and so do error branches unless `error_branches`; a
     badge on a place counts its hidden exits. `marking` (of `Task.net`, or of the net) replaces the initial tokens; `overlay`
-    colours nodes and numbers the firings of a path.
+    colours nodes and numbers the firings of a path. `inside` opens a macro place, named as in the flat task: ValueError if
+    there is none.
     """
     scene = (
         scene_of_net(model, marking, title)
         if isinstance(model, Net)
-        else scene_of_task(model, error_branches, marking, title)
+        else scene_of_task(model, error_branches, marking, title, inside)
     )
     return render(scene.under(overlay) if overlay else scene)

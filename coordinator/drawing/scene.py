@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+from coordinator.conditions.wording import listed
 from coordinator.drawing.layout import Point, lay_out
+from coordinator.drawing.sheet import Sheet, sheet_of
 from coordinator.net import Marking, Net
 from coordinator.task import End, Kind, Place, Scope, Task, Transition
+from coordinator.task.macros import macros_around
 
 RADIUS = 21.0
 BAR = (4.0, 21.0)
@@ -52,16 +55,16 @@ class Overlay:
     path: Sequence[str] = ()
     legend: str = ""
 
-    def on(self, node: Node) -> Node:
-        """The node with what is told of it; what lies inside a macro place is told of that place."""
-        heat = [h for name, h in self.heat.items() if node.name in (name, name.partition(".")[0])]
-        turns = [str(i) for i, name in enumerate(self.path, 1) if node.name in (name, name.partition(".")[0])]
+    def on(self, node: Node, shown: Mapping[str, str]) -> Node:
+        """The node with what is told of it; what lies inside a macro place (by `shown`) is told of that place."""
+        heat = [h for name, h in self.heat.items() if node.name == shown.get(name, name)]
+        turns = [str(i) for i, name in enumerate(self.path, 1) if node.name == shown.get(name, name)]
         if not heat and not turns:
             return node
         share = min(1.0, sum(heat)) if heat else None
         hint = node.hint + (f": {100 * share:.0f} %" if share is not None else "")
-        shown = turns if len(turns) <= TURNS else [*turns[: TURNS - 1], f"… {turns[-1]}"]
-        return replace(node, heat=share, turns=", ".join(shown), hint=hint)
+        told = turns if len(turns) <= TURNS else [*turns[: TURNS - 1], f"… {turns[-1]}"]
+        return replace(node, heat=share, turns=", ".join(told), hint=hint)
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,38 +87,41 @@ class Scene:
     nodes: Mapping[str, Node]
     arcs: tuple[Arc, ...] = field(default=())
     legend: str = ""
+    shown: Mapping[str, str] = field(default_factory=dict)
+    """Places and transitions that are drawn as another node, the macro place around them."""
 
     def under(self, overlay: Overlay) -> Scene:
         """The same scene with an overlay."""
-        nodes = {name: overlay.on(node) for name, node in self.nodes.items()}
+        nodes = {name: overlay.on(node, self.shown) for name, node in self.nodes.items()}
         return replace(self, nodes=nodes, legend=overlay.legend)
 
 
-def scene_of_task(task: Task, error_branches: bool, marking: Marking | None, title: str | None) -> Scene:
-    """The scene of a task as its file has it."""
-    folded = frozenset() if error_branches else _folded(task)
-    places = {n: p for n, p in task.places.items() if n not in folded}
-    transitions = {n: t for n, t in task.transitions.items() if n not in folded}
-    arcs = tuple(
-        a for t in transitions.values() for a in _task_arcs(task, t) if {a.source, a.target}.isdisjoint(folded)
-    )
-    wanted = {n: _given(p.x, p.y) for n, p in places.items()} | {n: _given(t.x, t.y) for n, t in transitions.items()}
-    at = lay_out(wanted, [(a.source, a.target) for a in arcs], [n for n, p in places.items() if p.tokens])
-    tokens = _tokens(task, marking)
-    nodes = {n: _place_node(task, p, at[n], tokens.get(n, 0), folded) for n, p in places.items()}
-    nodes |= {n: _transition_node(task, t, at, arcs) for n, t in transitions.items()}
-    return Scene(title or task.name, task.text or task.goal or "Petri net of a robot task", nodes, arcs)
+def scene_of_task(
+    task: Task, error_branches: bool, marking: Marking | None, title: str | None, inside: str = ""
+) -> Scene:
+    """The scene of a task as its file has it, or of the inside of a macro place. Raises ValueError when there is none."""
+    sheet = sheet_of(task, inside, error_branches, marking)
+    arcs = tuple(_joined_arcs(sheet))
+    drawn: dict[str, Place | Transition] = {**sheet.places, **sheet.transitions}
+    wanted = {n: _given(e.x, e.y) if n not in sheet.border else None for n, e in drawn.items()}
+    at = lay_out(wanted, [(a.source, a.target) for a in arcs], [n for n in sheet.places if sheet.tokens.get(n)])
+    nodes = {n: _place_node(sheet, p, at[n]) for n, p in sheet.places.items()}
+    nodes |= {n: _transition_node(sheet, t, at, arcs) for n, t in sheet.transitions.items()}
+    heading = title or (f"{task.name}: {inside}" if inside else task.name)
+    return Scene(heading, task.text or task.goal or "Petri net of a robot task", nodes, arcs, shown=_elsewhere(sheet))
 
 
-def _folded(task: Task) -> frozenset[str]:
-    """Error branches, and the places that nothing else touches."""
-    errors = task.error_elements
-    touched: dict[str, list[bool]] = {}
-    for t in task.transitions.values():
-        names = [a.place for a in t.inputs] + [a.place for a in t.outputs] + [a.place for a in t.inhibitors]
-        for name in names:
-            touched.setdefault(name, []).append(t.name in errors)
-    return errors | {place for place, hidden in touched.items() if all(hidden)}
+def _elsewhere(sheet: Sheet) -> dict[str, str]:
+    """By name in the flat task, what is drawn as a macro place here."""
+    net = sheet.task
+    shown = {sheet.prefix + name: here for name, here in sheet.shown.items()}
+    for name, t in net.flat.transitions.items():
+        around = next((m for m in macros_around(t.macro, net.places) if m in sheet.places), name.partition(".")[0])
+        shown[sheet.prefix + name] = name if name in sheet.transitions else around
+    for name in net.flat.places:
+        head = name.partition(".")[0]
+        shown.setdefault(sheet.prefix + name, sheet.shown.get(head, head))
+    return shown
 
 
 def scene_of_net(net: Net, marking: Marking | None, title: str | None) -> Scene:
@@ -145,34 +151,41 @@ def _given(x: float | None, y: float | None) -> Point | None:
     return None if x is None or y is None else (x, y)
 
 
-def _tokens(task: Task, marking: Marking | None) -> dict[str, int]:
-    """Tokens by drawn place; a macro place shows those of all its subnet's places."""
-    net = task.net
-    tokens: dict[str, int] = {}
-    for name, n in zip(net.places, marking or net.initial, strict=True):
-        for shown in {name, name.partition(".")[0]}:
-            tokens[shown] = tokens.get(shown, 0) + n
-    return tokens
+def _joined_arcs(sheet: Sheet) -> Iterable[Arc]:
+    """The sheet's arcs; those that end in one macro place in the same way are drawn as one, with their weights summed."""
+    joined: dict[tuple[str, str, str], Arc] = {}
+    for t in sheet.transitions.values():
+        for arc in _task_arcs(sheet, t):
+            key = (arc.source, arc.target, arc.kind)
+            before = joined.get(key)
+            joined[key] = arc if before is None else replace(arc, weight=before.weight + arc.weight)
+    return [a for a in joined.values() if a.source in sheet.places or a.target in sheet.places]
 
 
-def _task_arcs(task: Task, t: Transition) -> Iterable[Arc]:
-    error = t.name in task.error_elements
+def _task_arcs(sheet: Sheet, t: Transition) -> Iterable[Arc]:
+    style = "error" if t.name in sheet.task.error_elements else ""
+    shown = sheet.shown
     for a in t.inputs:
-        kind = a.end.value if a.end is not None else "plain"
-        yield Arc(a.place, t.name, a.weight, kind, "error" if error else "")
+        if a.place in shown:
+            yield Arc(shown[a.place], t.name, a.weight, a.end.value if a.end is not None else "plain", style)
     for i in t.inhibitors:
-        yield Arc(i.place, t.name, i.threshold, "inhibitor", "error" if error else "")
+        if i.place in shown:
+            yield Arc(shown[i.place], t.name, i.threshold, "inhibitor", style)
     for o in t.outputs:
-        yield Arc(t.name, o.place, o.weight, "plain", "error" if error else "")
+        if o.place in shown:
+            yield Arc(t.name, shown[o.place], o.weight, "plain", style)
 
 
-def _place_node(task: Task, p: Place, at: Point, tokens: int, folded: frozenset[str]) -> Node:
-    hidden = sum(any(a.place == p.name for a in task.transitions[t].inputs) for t in folded & set(task.transitions))
+def _place_node(sheet: Sheet, p: Place, at: Point) -> Node:
+    task = sheet.task
+    exits = [task.transitions[t] for t in sheet.folded & set(task.transitions)]
+    inside = {n for n in task.places if p.name in (n, *macros_around(task.places[n].macro, task.places))}
+    hidden = sum(t.macro not in inside and any(a.place in inside for a in t.inputs) for t in exits)
     what = {
         Kind.ACTION: f"action place, primitive task {p.task}",
         Kind.RESOURCE: "resource place",
         Kind.CONTROL: "control place: the operator may change its tokens",
-        Kind.MACRO: f"macro place, subnet {p.subnet}",
+        Kind.MACRO: f"macro place, subnet {p.subnet}" if p.subnet else f"macro place of {listed(inside - {p.name})}",
     }[p.kind]
     lines = [p.label or p.name]
     if p.kind is Kind.ACTION and p.task != p.name:
@@ -180,11 +193,13 @@ def _place_node(task: Task, p: Place, at: Point, tokens: int, folded: frozenset[
     capacity = f", at most {p.capacity}" if p.capacity is not None else ""
     hint = f"{p.name}: {what}{capacity}"
     style = f"place {p.kind}" + (" error" if p.name in task.error_elements else "")
-    return Node(p.name, True, at, style, tuple(lines), hint, tokens, hidden)
+    return Node(p.name, True, at, style, tuple(lines), hint, sheet.tokens.get(p.name, 0), hidden)
 
 
-def _transition_node(task: Task, t: Transition, at: Mapping[str, Point], arcs: Iterable[Arc]) -> Node:
+def _transition_node(sheet: Sheet, t: Transition, at: Mapping[str, Point], arcs: Iterable[Arc]) -> Node:
+    task = sheet.task
     style = "transition" + (" error" if t.name in task.error_elements else "")
+    style += " outside" if t.name in sheet.border else ""
     hint = f"transition {t.name}"
     if t.priority:
         hint += f", priority {t.priority}"

@@ -30,6 +30,7 @@ text{font:12.5px system-ui,-apple-system,"Segoe UI","DejaVu Sans",sans-serif;fil
 .place.error{stroke:#c0262d}
 .transition{fill:#1c2430}
 .transition.error{fill:#c0262d}
+.outside{fill-opacity:.35}
 .token{fill:#1c2430}
 .count{font-weight:600}
 .arc{fill:none;stroke:#4a5568;stroke-width:1.3}

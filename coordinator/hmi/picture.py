@@ -23,18 +23,21 @@ def picture(task: Task) -> dict[str, Any]:
         "events": {name: _event(e) for name, e in task.events.items()},
         "places": [
             *(_place(p, p.name in errors) for p in flat.places.values()),
-            *({**_place(p, False), "name": name, "in_macro": name.rpartition(".")[0]} for name, p in macros.items()),
+            *({**_place(p, False), "name": name, "in_macro": around} for name, (p, around) in macros.items()),
         ],
         "transitions": [_transition(t, flat, t.name in errors) for t in flat.transitions.values()],
         "arcs": [arc for t in flat.transitions.values() for arc in _arcs(t)],
     }
 
 
-def _macros(task: Task, places: Mapping[str, Place], prefix: str) -> Iterator[tuple[str, Place]]:
+def _macros(task: Task, places: Mapping[str, Place], prefix: str) -> Iterator[tuple[str, tuple[Place, str]]]:
+    """Each macro place by its full name, with the full name of the one around it."""
     for place in places.values():
         if place.kind is Kind.MACRO:
-            yield prefix + place.name, place
-            yield from _macros(task, task.subnets[place.subnet].places, f"{prefix}{place.name}.")
+            around = prefix + place.macro if place.macro else prefix.removesuffix(".")
+            yield prefix + place.name, (place, around)
+            if place.subnet:
+                yield from _macros(task, task.subnets[place.subnet].places, f"{prefix}{place.name}.")
 
 
 def _place(place: Place, error: bool) -> dict[str, Any]:
@@ -42,7 +45,7 @@ def _place(place: Place, error: bool) -> dict[str, Any]:
         "name": place.name,
         "kind": place.kind.value,
         "label": place.label,
-        "in_macro": place.name.rpartition(".")[0],
+        "in_macro": place.macro,
         "x": place.x,
         "y": place.y,
         "tokens": place.tokens,
@@ -59,7 +62,7 @@ def _transition(transition: Transition, task: Task, error: bool) -> dict[str, An
     return {
         "name": transition.name,
         "label": transition.label,
-        "in_macro": transition.name.rpartition(".")[0],
+        "in_macro": transition.macro,
         "x": transition.x,
         "y": transition.y,
         "events": [_event_words(e, task) for e in transition.events],

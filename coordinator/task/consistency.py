@@ -14,6 +14,7 @@ from math import isfinite
 from coordinator.conditions import Expression
 from coordinator.conditions.regions import Domain, kind_faults
 from coordinator.conditions.wording import Fault, listed, nearest
+from coordinator.task.macros import macro_faults
 from coordinator.task.model import (
     Early,
     End,
@@ -161,6 +162,7 @@ def _net(
         key = f"{prefix}transitions.{transition.name}"
         yield from _arcs(key, transition, places)
         yield from _trigger(task, key, transition)
+    yield from macro_faults(prefix, places, transitions)
 
 
 def _place(task: Task, key: str, p: Place) -> Iterator[Fault]:
@@ -175,11 +177,11 @@ def _place(task: Task, key: str, p: Place) -> Iterator[Fault]:
             key, f"a {p.kind} place runs no action", "drop task, args, out and servers, or make its kind action"
         )
     if p.kind is Kind.MACRO:
-        if p.subnet not in task.subnets:
+        if p.subnet and p.subnet not in task.subnets:
             remedy = f"name one of [subnets]{nearest(p.subnet, task.subnets)}"
             yield Fault(f"{key}.subnet", f"{p.subnet!r} is no subnet", remedy)
         if p.tokens or p.capacity is not None:
-            yield Fault(key, "a macro place holds no tokens of its own", "put them into the subnet's places")
+            yield Fault(key, "a macro place holds no tokens of its own", "put them into the places inside it")
     elif p.subnet:
         yield Fault(f"{key}.subnet", f"a {p.kind} place stands for no subnet", "drop `subnet` or make its kind macro")
 
@@ -245,7 +247,7 @@ def _input(key: str, arc: Input, place: Place) -> Iterator[Fault]:
     if place.kind is Kind.ACTION and arc.end is None:
         remedy = f"write {name}:normal, {name}:error, {name}:preempt=COUNTS or {name}:going"
         yield Fault(key, f"{name!r} is an action place, so its arc says when it takes the token", remedy)
-    if place.kind is Kind.MACRO and arc.end not in (End.NORMAL, End.ERROR):
+    if place.kind is Kind.MACRO and place.subnet and arc.end not in (End.NORMAL, End.ERROR):
         yield Fault(key, f"{name!r} is a macro place", f"write {name}:normal or {name}:error")
     if place.kind in (Kind.RESOURCE, Kind.CONTROL) and arc.end is not None:
         yield Fault(key, f"{name!r} runs no action that could end", f"write {name} alone")

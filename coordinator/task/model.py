@@ -45,7 +45,7 @@ class Kind(StrEnum):
     CONTROL = "control"
     """Task flow alone; the operator may put tokens in and take them out."""
     MACRO = "macro"
-    """A whole subnet drawn as one place."""
+    """A part of the net drawn as one place: a subnet of its own, or the places and transitions that name it."""
 
 
 class End(StrEnum):
@@ -165,7 +165,9 @@ class Place:
     servers: int | None = None
     """Action place: how many runs go on at once, further tokens queue; None: one, and a second token is a fault."""
     subnet: str = ""
-    """Macro place: the subnet that it stands for."""
+    """Macro place: the subnet that it stands for; empty for one that only shows those that name it in `macro`."""
+    macro: str = ""
+    """Macro place within which it is drawn; empty: none. Its meaning is the same with and without."""
     label: str = ""
     x: float | None = None
     y: float | None = None
@@ -217,6 +219,7 @@ class Transition:
     """Fires so many seconds after its arcs became satisfied."""
     error_branch: bool = False
     """Said to belong to an error branch; those behind an `error` arc belong there without saying so."""
+    macro: str = ""  # as of a place
     label: str = ""
     x: float | None = None
     y: float | None = None
@@ -331,7 +334,7 @@ class Task:
 
     @cached_property
     def flat(self) -> Task:
-        """The task with every macro place replaced by its subnet; itself if there is none."""
+        """The task with every macro place replaced by its subnet or by those drawn within it; itself if there is none."""
         from coordinator.task.subnets import expand
 
         return expand(self) if any(p.kind is Kind.MACRO for p in self.places.values()) else self

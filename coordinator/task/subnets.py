@@ -1,4 +1,8 @@
-"""Macro places: a task with every macro place replaced by its subnet, names prefixed with the macro place's."""
+"""Macro places: a task with every macro place replaced by its subnet, names prefixed with the macro place's.
+
+A macro place without a subnet only shows what is drawn within it (`macro`): that stays as it is, the place is dropped. In the
+flat task `macro` of every place and transition is the full name of the innermost macro place around it.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +37,8 @@ def _unfold(
     for place in new_places.values():
         name = prefix + place.name
         if place.kind is not Kind.MACRO:
-            places[name] = replace(place, name=name)
+            places[name] = replace(place, name=name, macro=_around(prefix, place.macro))
+        if place.kind is not Kind.MACRO or not place.subnet:
             continue
         if place.subnet in inside:
             raise ValueError(f"subnet {place.subnet!r} contains itself by {' > '.join((*inside, place.subnet))}")
@@ -46,6 +51,11 @@ def _unfold(
         transitions[prefix + transition.name] = _prefixed(transition, prefix, new_places) if prefix else transition
 
 
+def _around(prefix: str, macro: str) -> str:
+    """The full name of the innermost macro place around something: the one it names, else the one whose subnet it is in."""
+    return prefix + macro if macro else prefix.removesuffix(".")
+
+
 def _prefixed(transition: Transition, prefix: str, siblings: Mapping[str, Place]) -> Transition:
     when = transition.when
     if when is not None:
@@ -53,6 +63,7 @@ def _prefixed(transition: Transition, prefix: str, siblings: Mapping[str, Place]
     return replace(
         transition,
         name=prefix + transition.name,
+        macro=_around(prefix, transition.macro),
         when=when,
         inputs=tuple(replace(a, place=prefix + a.place) for a in transition.inputs),
         outputs=tuple(replace(a, place=prefix + a.place) for a in transition.outputs),

@@ -5,6 +5,8 @@ import { icon } from "./icons.js";
 import { Minimap } from "./minimap.js";
 import { NetView } from "./net_view.js";
 
+const HITS = 9;
+
 export const tool = (name, label, onclick, properties = {}) =>
   h("button", { type: "button", class: "tool", "aria-label": label, title: label, onclick, ...properties }, icon(name));
 
@@ -46,19 +48,21 @@ export class Canvas {
   }
 
   find() {
-    const wanted = this.query.value.trim().toLowerCase().replaceAll(" ", "_");
-    const all = [...this.view.elements.values()];
-    const found = wanted ? all.filter((e) => e.name.toLowerCase().includes(wanted) || (e.label ?? "").toLowerCase().includes(this.query.value.trim().toLowerCase())) : [];
-    this.view.only("hit", new Set(found.map((e) => e.name)));
-    fill(this.hits, found.slice(0, 9).map((e) =>
-      h("li", { role: "option", onpointerdown: (event) => { event.preventDefault(); this.goTo(e.name); } }, words(e.name), h("span", {}, e.shape === "place" ? e.kind : "transition"))));
-    this.found = found;
+    const typed = this.query.value.trim().toLowerCase();
+    const matches = (name, label) => Boolean(typed) && (name.toLowerCase().includes(typed.replaceAll(" ", "_")) || label.toLowerCase().includes(typed));
+    const here = [...this.view.elements.values()].filter((e) => matches(e.name, e.label ?? ""));
+    this.view.only("hit", new Set(here.map((e) => e.name)));
+    this.found = [...here.map((e) => ({ name: e.name, kind: e.shape === "place" ? e.kind : "transition", go: () => this.goTo(e.name) })), ...(this.view.events.elsewhere?.(matches) ?? [])];
+    this.turn = -1;
+    fill(this.hits, this.found.slice(0, HITS).map((e) =>
+      h("li", { role: "option", onpointerdown: (event) => { event.preventDefault(); e.go(); } }, words(e.name), h("span", {}, words(e.kind)))),
+      this.found.length > HITS ? h("li", { class: "more" }, `${this.found.length - HITS} more: Enter goes through all`) : null);
   }
 
   searchKey(event) {
     if (event.key === "Enter" && this.found?.length) {
-      this.turn = ((this.turn ?? -1) + 1) % this.found.length;
-      this.goTo(this.found[this.turn].name);
+      this.turn = (this.turn + 1) % this.found.length;
+      this.found[this.turn].go();
     } else if (event.key === "Escape") {
       this.query.value = "";
       this.find();

@@ -5,7 +5,7 @@ import { attribute, fill, h, seconds, text, words } from "./dom.js";
 import { listRuns, openRun } from "./files.js";
 import { icon } from "./icons.js";
 import { reasonText } from "./live.js";
-import { alarmed, sheetOf, tokensOf } from "./sheet.js";
+import { alarmed, sheetOf, tokensOf, trailOf } from "./sheet.js";
 
 const SESSION = "(this run)";
 const ROWS_AROUND = 120;
@@ -72,8 +72,8 @@ class Screen {
     const { task } = this.reel.run;
     if (!task) return;
     this.canvas.show(sheetOf(task, this.inside));
-    const parts = this.inside ? this.inside.split(".") : [];
-    this.canvas.trail([task.name, ...parts], (i) => this.open(parts.slice(0, i).join(".")));
+    const path = trailOf(task, this.inside);
+    this.canvas.trail([task.name, ...path.map((p) => p.label)], (i) => this.open(i ? path[i - 1].name : ""));
     this.show(this.index ?? 0, false);
   }
 

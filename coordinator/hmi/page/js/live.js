@@ -7,7 +7,7 @@ import { attribute, fill, h, rows, seconds, text, words } from "./dom.js";
 import { icon } from "./icons.js";
 import { stateOf } from "./operator.js";
 import { Selected } from "./selected.js";
-import { alarmed, sheetOf, tokensOf } from "./sheet.js";
+import { alarmed, sheetOf, tokensOf, trailOf } from "./sheet.js";
 import { Timeline } from "./timeline.js";
 
 const FIRINGS_SHOWN = 25;
@@ -60,8 +60,8 @@ export class Live {
     if (!task) return;
     if (this.inside && !task.places.some((p) => p.name === this.inside)) this.inside = "";
     this.canvas.show(sheetOf(task, this.inside));
-    const parts = this.inside ? this.inside.split(".") : [];
-    this.canvas.trail([task.name, ...parts], (i) => this.open(parts.slice(0, i).join(".")));
+    const path = trailOf(task, this.inside);
+    this.canvas.trail([task.name, ...path.map((p) => p.label)], (i) => this.open(i ? path[i - 1].name : ""));
     this.paintTokens();
     this.paintRuns();
     this.paintMarks();

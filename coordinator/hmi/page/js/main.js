@@ -1,7 +1,7 @@
 // Puts the page together: header, tabs, theme, and one painter for all that the link brings.
 
 import { Canvas } from "./canvas.js";
-import { Designer } from "./designer.js";
+import { Designer } from "./design/designer.js";
 import { attribute, h, text } from "./dom.js";
 import { History } from "./history.js";
 import { icon } from "./icons.js";

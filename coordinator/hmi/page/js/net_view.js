@@ -134,6 +134,7 @@ export class NetView {
     text(parts.title, element.hint ?? element.name);
     this.name(element);
     attribute(element.node, "data-error", element.error ? "" : null);
+    attribute(element.node, "data-outside", element.outside ? "" : null);
   }
 
   name(element) {

@@ -22,41 +22,61 @@ export function onlyErrors(net) {
   return { ...net, places: net.places.map((p) => (used.get(p.name) ? { ...p, error: true } : p)) };
 }
 
-/** The net {places, transitions, arcs} of one sheet; `inside` is the name of a macro place, "" for the whole. */
+const macrosOf = (task) => new Map([...task.places, ...task.transitions].map((e) => [e.name, e.in_macro ?? ""]));
+
+/** The macro places around an element of the whole net, innermost first. */
+function around(macros, name) {
+  const found = [];
+  for (let macro = macros.get(name); macro && !found.includes(macro); macro = macros.get(macro)) found.push(macro);
+  return found;
+}
+
+/** The way to an opened macro place: [{name, label}], outermost first. */
+export function trailOf(task, inside) {
+  const labels = new Map(task.places.map((p) => [p.name, p.label || p.name.split(".").at(-1)]));
+  return inside ? [...around(macrosOf(task), inside).reverse(), inside].map((name) => ({ name, label: labels.get(name) ?? name })) : [];
+}
+
+/**
+ * The net {places, transitions, arcs} of one sheet; `inside` is the name of a macro place, "" for the whole. Transitions that
+ * join what is inside with what is around it are drawn beside it, as `outside`.
+ */
 export function sheetOf(task, inside) {
-  const macros = new Set(task.places.filter((p) => p.kind === "macro").map((p) => p.name));
+  const macros = macrosOf(task);
   const shownAs = (name) => {
-    // the outermost macro place that closes over an element on this sheet
-    const prefix = inside ? inside.length + 1 : 0;
-    const rest = name.slice(prefix).split(".");
-    for (let n = 1; n < rest.length; n++) {
-      const macro = name.slice(0, prefix) + rest.slice(0, n).join(".");
-      if (macros.has(macro)) return macro;
-    }
-    return name;
+    const chain = [name, ...around(macros, name)];
+    return inside ? chain[chain.indexOf(inside) - 1] : chain.at(-1);
   };
   const here = (e) => (e.in_macro ?? "") === inside;
-  const transitions = task.transitions.filter(here);
+  const arcs = task.arcs.map((a) => ({ ...a, place: shownAs(a.place) })).filter((a) => a.place);
+  const joined = new Set(arcs.map((a) => a.transition));
+  const outside = (t) => inside && joined.has(t.name) && !around(macros, t.name).includes(inside);
+  const transitions = task.transitions.filter((t) => here(t) || outside(t)).map((t) => (here(t) ? t : { ...t, x: undefined, y: undefined, outside: true }));
   const names = new Set(transitions.map((t) => t.name));
-  const arcs = task.arcs.filter((a) => names.has(a.transition)).map((a) => ({ ...a, place: shownAs(a.place) }));
-  const places = task.places.filter(here);
-  const known = new Set(places.map((p) => p.name));
-  const base = (e) => (e.label ? e : { ...e, label: e.name.slice(inside ? inside.length + 1 : 0) });
+  const base = (e) => (e.label ? e : { ...e, label: e.outside ? e.name : e.name.startsWith(`${inside}.`) ? e.name.slice(inside.length + 1) : e.name.split(".").at(-1) });
   return placed(onlyErrors({
-    places: places.map((p) => base({ ...p, sub: p.kind === "action" && p.primitive_task !== p.name ? words(p.primitive_task) : "", hint: hintPlace(p) })),
+    places: task.places.filter(here).map((p) => base({ ...p, sub: p.kind === "action" && p.primitive_task !== p.name ? words(p.primitive_task) : "", hint: hintPlace(p) })),
     transitions: transitions.map((t) => base({ ...t, sub: caption(t), hint: hintTransition(t) })),
-    arcs: arcs.filter((a) => known.has(a.place)),
+    arcs: summed(arcs.filter((a) => names.has(a.transition))),
   }));
+}
+
+/** Arcs that end alike in one macro place are one, with their weights summed. */
+function summed(arcs) {
+  const joined = new Map();
+  for (const arc of arcs) {
+    const id = `${arc.direction}|${arc.place}|${arc.transition}|${arc.end ?? ""}`;
+    joined.set(id, { ...arc, weight: (arc.weight ?? 1) + (joined.get(id)?.weight ?? 0) });
+  }
+  return [...joined.values()];
 }
 
 /** Tokens of what is drawn: a macro place shows all that its inside holds. */
 export function tokensOf(task, marking) {
   const shown = { ...marking };
-  for (const place of task.places) {
-    if (place.kind !== "macro") continue;
-    const prefix = `${place.name}.`;
-    shown[place.name] = Object.entries(marking).reduce((sum, [name, n]) => sum + (name.startsWith(prefix) ? n : 0), 0);
-  }
+  const macros = macrosOf(task);
+  for (const place of task.places) if (place.kind === "macro") shown[place.name] = 0;
+  for (const [name, n] of Object.entries(marking)) for (const macro of around(macros, name)) shown[macro] += n;
   return shown;
 }
 

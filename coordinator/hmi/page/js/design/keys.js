@@ -1,7 +1,8 @@
 // The designer by keyboard alone, and the list of its keys.
 
-import { openDialog } from "./dialog.js";
-import { h } from "./dom.js";
+import { openDialog } from "../dialog.js";
+import { h } from "../dom.js";
+import { nudge } from "./arrange.js";
 
 const STEP = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 const TOOL = { v: "select", 1: "action", 2: "resource", 3: "control", 4: "macro", t: "transition", a: "arc", i: "inhibit" };
@@ -11,6 +12,7 @@ const LIST = [
   ["T", "tool for a transition"], ["A, I", "arc or inhibitor arc from the selected element: go to the target with Ctrl and arrows, press Enter"],
   ["V, Esc", "back to the selection tool; Esc never deletes anything"],
   ["Ctrl + arrows", "select the nearest element in that direction"], ["[ and ]", "previous and next element"],
+  ["Ctrl G, Ctrl Shift G", "put the selection into a macro place; dissolve the macro place"], ["O, Backspace", "open the selected macro place; with nothing selected, back to what is around it"],
   ["Arrows", "move the selection by one grid step; with Shift by five"], ["Enter", "properties of the selected element"],
   ["Delete", "delete the selection"], ["Ctrl Z, Ctrl Y", "undo, redo"], ["Ctrl C, X, V, D", "copy, cut, paste, duplicate"],
   ["Ctrl A", "select everything"], ["Ctrl S", "save"], ["Ctrl F", "find"], ["+ and -, 0", "zoom, whole net"],
@@ -37,13 +39,14 @@ export class Keys {
   withControl(event, typing) {
     const { designer } = this;
     const key = event.key.toLowerCase();
-    if (key === "s") return designer.save() ?? true;
+    if (key === "s") return designer.desk.save() ?? true;
     if (key === "f") return designer.canvas.query.focus() ?? true;
     if (typing) return false;
     if (STEP[event.key]) return this.nearest(...STEP[event.key]);
     const acts = {
       z: () => (event.shiftKey ? designer.redo() : designer.undo()), y: () => designer.redo(), c: () => designer.copy(),
       x: () => { designer.copy(); designer.removeChosen(); }, v: () => designer.paste(), d: () => { designer.copy(); designer.paste(); },
+      g: () => (event.shiftKey ? designer.ungroup() : designer.group()),
       a: () => designer.choose(new Set(designer.view.elements.keys())),
     };
     if (!acts[key]) return false;
@@ -54,15 +57,17 @@ export class Keys {
   plain(event) {
     const { designer } = this;
     const button = event.target.closest?.("button") && !event.target.closest("svg");
-    if (event.key === "Escape") return designer.use("select") ?? true;
+    if (event.key === "Escape") return designer.tools.use("select") ?? true;
     if (button && ["Enter", " "].includes(event.key)) return false;
     if (STEP[event.key]) return this.nudge(STEP[event.key], event.shiftKey ? 50 : 10);
+    if (event.key === "Backspace" && !designer.selected.names.size && !designer.selected.arc) return designer.up() ?? true;
     if (event.key === "Delete" || event.key === "Backspace") return designer.removeChosen() ?? true;
     if (event.key === "[" || event.key === "]") return this.next(event.key === "]" ? 1 : -1);
     if (event.key === "?") return designer.help.open() ?? true;
     if (event.key === "+" || event.key === "-") return designer.view.zoomBy(event.key === "+" ? 1.25 : 0.8) ?? true;
     if (event.key === "0") return designer.view.fit() ?? true;
     if (event.key === "Enter") return this.enter();
+    if (event.key.toLowerCase() === "o") return this.open();
     const tool = TOOL[event.key.toLowerCase()];
     if (!tool) return false;
     this.useTool(tool);
@@ -72,40 +77,42 @@ export class Keys {
   useTool(tool) {
     const { designer } = this;
     const [first] = designer.selection.names;
-    designer.use(tool);
-    if ((tool === "arc" || tool === "inhibit") && first) {
-      designer.arcFrom = first;
-      designer.view.only("target", new Set([first]));
-      designer.tell(`From ${first}: go to the target with Ctrl and the arrow keys, then press Enter.`);
-    }
+    designer.tools.use(tool);
+    if (designer.tools.draws && first) designer.tools.from(first, `From ${first}: go to the target with Ctrl and the arrow keys, then press Enter.`);
   }
 
   enter() {
     const { designer } = this;
     const [first] = designer.selection.names;
-    if (designer.tool === "arc" || designer.tool === "inhibit") {
-      if (!designer.arcFrom) designer.arcFrom = first;
-      else if (first && first !== designer.arcFrom && designer.connect(designer.arcFrom, first)) {
-        designer.use("select");
-        designer.choose(new Set([first]));
-      }
+    const { tools } = designer;
+    if (tools.draws) {
+      if (!tools.arcFrom && first) tools.from(first, `From ${first}: go to the target with Ctrl and the arrow keys, then press Enter.`);
+      else if (first && first !== tools.arcFrom) this.endArc(first);
       return true;
     }
-    if (designer.tool !== "select") {
-      const kind = designer.tool;
-      designer.insertFree(kind);
+    if (tools.tool !== "select") {
+      tools.insertFree(tools.tool);
       return true;
     }
-    if (first) designer.inspector.root.querySelector("input.name")?.focus();
+    if (first) designer.inspector.focusName();
     return Boolean(first);
   }
 
+  open() {
+    const [first] = this.designer.selected.elements;
+    if (first) this.designer.opened(first);
+    return Boolean(first);
+  }
+
+  async endArc(target) {
+    const { designer } = this;
+    if (!(await designer.connect(designer.tools.arcFrom, target))) return;
+    designer.tools.use("select");
+    designer.choose(new Set([target]));
+  }
+
   nudge([dx, dy], step) {
-    const chosen = this.designer.chosenElements();
-    if (!chosen.length) return false;
-    this.designer.model.move(Object.fromEntries(chosen.map((e) => [e.name, [e.x + dx * step, e.y + dy * step]])), "nudge");
-    this.designer.view.reroute(new Set(), true);
-    return true;
+    return nudge(this.designer, dx * step, dy * step);
   }
 
   nearest(dx, dy) {

@@ -1,26 +1,15 @@
 // A task file's document while it is drawn: plain data, edits with undo, and the net that it describes.
 
-import { words } from "./dom.js";
-import { caption, onlyErrors } from "./sheet.js";
+import { words } from "../dom.js";
+import { listed, readArc, repoint, writeArc } from "./arcs.js";
+import { drawn } from "./drawn.js";
+import { around, group, groups, members, own, ungroup, within } from "./macros.js";
 
-const ARC = /^(!?)\s*([\p{L}\p{N}_.]+)(?::(\w+)(?:=(\w+))?)?(?:\s*\*\s*(\d+))?$/u;
 const UNDO_KEPT = 300;
 const NAME = /^[\p{L}_][\p{L}\p{N}_]*$/u;
 
-/** One arc of `in` or `out`: {place, end, counts, weight, inhibit}; null when the text is none. */
-export function readArc(text) {
-  const found = ARC.exec(String(text).trim());
-  return found ? { inhibit: Boolean(found[1]), place: found[2], end: found[3] ?? null, counts: found[4] ?? null, weight: Number(found[5] ?? 1) } : null;
-}
-
-export function writeArc({ place, end, counts, weight, inhibit }) {
-  const way = end ? `:${end}${counts ? `=${counts}` : ""}` : "";
-  return `${inhibit ? "!" : ""}${place}${inhibit ? "" : way}${weight > 1 ? `*${weight}` : ""}`;
-}
-
 export const emptyDocument = (name) => ({ schema: 1, task: { name, final: "false" }, primitive_tasks: {}, events: {}, places: {}, transitions: {} });
 
-const listed = (value) => (Array.isArray(value) ? value : value === undefined || value === "" ? [] : [value]);
 const copy = (value) => structuredClone(value);
 
 /** Rename an identifier in a condition; text in quotes and parts after a dot stay. */
@@ -43,6 +32,7 @@ export class Model {
     this.past = [];
     this.future = [];
     this.sheet = "";
+    this.inside = "";
     this.changed("load");
   }
 
@@ -64,7 +54,7 @@ export class Model {
 
   /** Alter the document by `change(data, net)`; edits of one `group` in a row are one step of undo. */
   edit(label, change, group = null) {
-    const before = { data: this.data, renames: this.renames, label, sheet: this.sheet };
+    const before = { ...this.state, label };
     const data = copy(this.data);
     this.renames = [...this.renames];
     const result = change(data, this.netOf(data));
@@ -94,16 +84,27 @@ export class Model {
   swap(from, to) {
     const state = from.pop();
     if (!state) return null;
-    to.push({ data: this.data, renames: this.renames, label: state.label, sheet: this.sheet });
+    to.push({ ...this.state, label: state.label });
     this.data = state.data;
     this.renames = state.renames;
-    if (this.hasSheet(state.sheet)) this.sheet = state.sheet;
+    this.open(state.sheet, state.inside);
     this.changed("edit");
     return state.label;
   }
 
+  /** What undo brings back. */
+  get state() {
+    return { data: this.data, renames: this.renames, sheet: this.sheet, inside: this.inside };
+  }
+
   hasSheet(sheet) {
     return !sheet || Boolean(this.data.subnets?.[sheet]);
+  }
+
+  /** Draw a subnet ("" for the task's own net) with one of its macro places opened ("" for none), as far as they exist. */
+  open(sheet, inside = "") {
+    this.sheet = this.hasSheet(sheet) ? sheet : "";
+    this.inside = groups(this.place(inside)) ? inside : "";
   }
 
   /** The part of the document that is drawn on this sheet. */
@@ -123,11 +124,11 @@ export class Model {
   }
 
   place(name) {
-    return this.net.places?.[name];
+    return own(this.net.places, name);
   }
 
   transition(name) {
-    return this.net.transitions?.[name];
+    return own(this.net.transitions, name);
   }
 
   has(name) {
@@ -135,7 +136,7 @@ export class Model {
   }
 
   freeName(stem, net = this.net) {
-    const taken = (n) => net.places?.[n] !== undefined || net.transitions?.[n] !== undefined;
+    const taken = (n) => Boolean(own(net.places, n) ?? own(net.transitions, n));
     if (!taken(stem)) return stem;
     const root = stem.replace(/_\d+$/, "");
     let i = 2;
@@ -143,11 +144,16 @@ export class Model {
     return `${root}_${i}`;
   }
 
+  /** What says of a new element that it stands in the opened macro place. */
+  get here() {
+    return this.inside ? { macro: this.inside } : {};
+  }
+
   addPlace(kind, x, y) {
     const stem = { action: "action", resource: "resource", control: "control", macro: "macro" }[kind];
     return this.edit(`add ${kind} place`, (_, net) => {
       const name = this.freeName(stem, net);
-      net.places[name] = { kind, ...(kind === "resource" ? { tokens: 1, capacity: 1 } : {}), ...(kind === "control" ? { capacity: 10 } : {}), x, y };
+      net.places[name] = { kind, ...(kind === "resource" ? { tokens: 1, capacity: 1 } : {}), ...(kind === "control" ? { capacity: 10 } : {}), ...this.here, x, y };
       return name;
     });
   }
@@ -155,7 +161,7 @@ export class Model {
   addTransition(x, y, stem = "transition") {
     return this.edit("add transition", (_, net) => {
       const name = this.freeName(stem, net);
-      net.transitions[name] = { in: [], out: [], x, y };
+      net.transitions[name] = { in: [], out: [], ...this.here, x, y };
       return name;
     });
   }
@@ -167,6 +173,7 @@ export class Model {
     if (a && b) return "An arc joins a place and a transition, never two places: put a transition between them.";
     if (!a && !b) return "An arc joins a place and a transition, never two transitions: put a place between them.";
     if (inhibit && !a) return "An inhibitor arc goes from a place to a transition.";
+    if (groups(a ?? b)) return "An arc goes to a place inside the macro place: put one into it first.";
     const place = a ? from : to;
     const transition = this.transition(a ? to : from);
     const same = listed(a ? transition.in : transition.out).map(readArc).find((arc) => arc?.place === place && arc.inhibit === inhibit);
@@ -190,6 +197,15 @@ export class Model {
     return ends.has("normal") && !ends.has("error") ? "error" : "normal";
   }
 
+  /** A transition for one way out of an action place; gives its name. */
+  addExit(place, end, x, y) {
+    return this.edit(end === "error" ? "add error branch" : "add exit", (_, net) => {
+      const name = this.freeName(end === "error" ? `${place}_error` : `${place}_done`, net);
+      net.transitions[name] = { in: [writeArc({ place, weight: 1, end })], out: [], ...this.here, x, y };
+      return name;
+    });
+  }
+
   /** Alter an arc ({direction, place, transition}); `null` takes it away. */
   setArc(arc, change) {
     this.edit(change ? "change arc" : "delete arc", (_, net) => {
@@ -203,16 +219,16 @@ export class Model {
     });
   }
 
+  /** Delete elements with their arcs, macro places with all that stands within, and arcs. */
   remove(names, arcs = []) {
     this.edit("delete", (_, net) => {
-      for (const arc of arcs) this.dropArc(net, arc);
-      for (const name of names) {
+      for (const arc of arcs) for (const place of arc.inner?.length ? arc.inner : [arc.place]) this.dropArc(net, { ...arc, place });
+      const gone = new Set([...names].flatMap((name) => [name, ...(groups(net.places[name]) ? within(net, name) : [])]));
+      for (const name of gone) {
         delete net.places[name];
         delete net.transitions[name];
       }
-      for (const t of Object.values(net.transitions)) {
-        for (const key of ["in", "out"]) if (t[key]) t[key] = listed(t[key]).filter((text) => !names.has(readArc(text)?.place));
-      }
+      for (const t of Object.values(net.transitions)) repoint(t, new Map(), gone);
     });
   }
 
@@ -245,7 +261,7 @@ export class Model {
   /** Give an element another name, wherever it is named; a text says why not. */
   rename(from, to) {
     if (to === from) return null;
-    if (!NAME.test(to)) return "A name begins with a letter and has letters, digits and _ only.";
+    if (!NAME.test(to) || to === "__proto__") return "A name begins with a letter and has letters, digits and _ only.";
     if (this.has(to)) return `There is already something called ${to} here.`;
     this.edit("rename", (data, net) => {
       const kind = net.places[from] ? "places" : "transitions";
@@ -259,15 +275,11 @@ export class Model {
 
   renamePlace(data, net, from, to) {
     for (const t of Object.values(net.transitions)) {
-      for (const key of ["in", "out"]) {
-        if (!t[key]) continue;
-        t[key] = listed(t[key]).map((text) => {
-          const arc = readArc(text);
-          return arc?.place === from ? writeArc({ ...arc, place: to }) : text;
-        });
-      }
+      repoint(t, new Map([[from, to]]));
       if (t.when) t.when = renamed(t.when, from, to);
     }
+    for (const e of [...Object.values(net.places), ...Object.values(net.transitions)]) if (e.macro === from) e.macro = to;
+    if (this.inside === from) this.inside = to;
     if (this.sheet) {
       for (const key of ["entry", "normal", "error"]) if (net[key] === from) net[key] = to;
       return;
@@ -288,35 +300,22 @@ export class Model {
     });
   }
 
-  /** Copy elements with the arcs among them; gives plain data for `paste`. */
-  clip(names) {
-    const pick = (table) => Object.fromEntries(Object.entries(table ?? {}).filter(([name]) => names.has(name)).map(([name, value]) => [name, copy(value)]));
-    const clip = { places: pick(this.net.places), transitions: pick(this.net.transitions) };
-    for (const t of Object.values(clip.transitions)) for (const key of ["in", "out"]) t[key] = listed(t[key]).filter((text) => names.has(readArc(text)?.place));
-    return clip;
-  }
-
-  paste(clip, dx, dy) {
-    return this.edit("paste", (_, net) => {
-      const names = new Map();
-      for (const kind of ["places", "transitions"]) {
-        for (const [name, value] of Object.entries(clip[kind] ?? {})) {
-          const free = this.freeName(name, net);
-          names.set(name, free);
-          net[kind][free] = { ...copy(value), x: (value.x ?? 0) + dx, y: (value.y ?? 0) + dy };
-        }
-      }
-      for (const name of Object.keys(clip.transitions ?? {})) {
-        const t = net.transitions[names.get(name)];
-        for (const key of ["in", "out"]) t[key] = listed(t[key]).map((text) => this.repointed(text, names));
-      }
-      return [...names.values()];
+  /** Put the chosen elements into a new macro place: {name, left}, or a text that says why not. */
+  group(names) {
+    const chosen = members(this.net, names, this.inside);
+    if (!chosen.members.some((n) => this.place(n))) return "Choose the places that the macro place is to hold, with the transitions between them.";
+    const name = this.edit("group", (_, net) => {
+      const macro = this.freeName("macro", net);
+      group(net, chosen.members, macro, this.inside);
+      return macro;
     });
+    return { name, left: chosen.left };
   }
 
-  repointed(text, names) {
-    const arc = readArc(text);
-    return arc ? writeArc({ ...arc, place: names.get(arc.place) ?? arc.place }) : text;
+  /** Dissolve macro places that group; gives the names of what came out. */
+  ungroup(names) {
+    const macros = [...names].filter((n) => groups(this.place(n)));
+    return macros.length ? this.edit("ungroup", (_, net) => macros.flatMap((macro) => ungroup(net, macro))) : [];
   }
 
   /** A new subnet with one entry and one exit for a macro place. */
@@ -331,45 +330,13 @@ export class Model {
     });
   }
 
-  // ---- the drawing --------------------------------------------------------------------------------------------------
-
-  /** The sheet's net for a view: elements with their meaning, arcs, and which of it error branches alone reach. */
-  picture() {
-    const { net, data } = this;
-    const events = data.events ?? {};
-    const arcs = [];
-    for (const [name, t] of Object.entries(net.transitions ?? {})) {
-      for (const text of listed(t.in)) {
-        const arc = readArc(text);
-        if (arc) arcs.push({ ...arc, transition: name, direction: arc.inhibit ? "inhibit" : "in", id: `in|${text}|${name}` });
-      }
-      for (const text of listed(t.out)) {
-        const arc = readArc(text);
-        if (arc) arcs.push({ ...arc, transition: name, direction: "out", id: `out|${text}|${name}` });
-      }
-    }
-    const error = this.errorElements(arcs);
-    const places = Object.entries(net.places ?? {}).map(([name, p]) => ({ name, kind: p.kind ?? "control", label: p.label ?? "", x: p.x, y: p.y, tokens: p.tokens ?? 0, sub: p.kind === "action" ? words(p.task && p.task !== name ? p.task : "") : p.kind === "macro" ? words(p.subnet) : "", error: error.has(name), hint: name }));
-    const transitions = Object.entries(net.transitions ?? {}).map(([name, t]) => ({
-      name, label: t.label ?? "", x: t.x, y: t.y, error: error.has(name), when: t.when ?? "", after: t.after, hint: name,
-      events: listed(t.event).map((e) => ({ name: e, scope: events[e]?.scope ?? "external" })),
-    }));
-    return onlyErrors({ places, transitions: transitions.map((t) => ({ ...t, sub: caption(t) })), arcs });
+  /** The macro places opened on the way to what is drawn, outermost first. */
+  get opened() {
+    return this.inside ? [...around(this.net, this.inside).reverse(), this.inside] : [];
   }
 
-  errorElements(arcs) {
-    const transitions = new Set(Object.entries(this.net.transitions ?? {}).filter(([, t]) => t.error_branch).map(([name]) => name));
-    for (const arc of arcs) if (arc.end === "error") transitions.add(arc.transition);
-    const places = new Set();
-    for (let grew = true; grew; ) {
-      grew = false;
-      for (const [name, place] of Object.entries(this.net.places ?? {})) {
-        if (places.has(name) || place.tokens) continue;
-        const feeders = arcs.filter((a) => a.direction === "out" && a.place === name);
-        if (feeders.length && feeders.every((a) => transitions.has(a.transition))) grew = Boolean(places.add(name));
-      }
-      for (const arc of arcs) if (arc.direction === "in" && places.has(arc.place) && !transitions.has(arc.transition)) grew = Boolean(transitions.add(arc.transition));
-    }
-    return new Set([...places, ...transitions]);
+  /** What of the opened sheet is drawn. */
+  picture() {
+    return drawn(this.data, this.net, this.inside);
   }
 }

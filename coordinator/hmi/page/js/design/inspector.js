@@ -1,26 +1,17 @@
 // The form for what is chosen in the designer: an element, an arc, several elements, or the task itself.
 
-import { fill, h, words } from "./dom.js";
-import { icon } from "./icons.js";
-import { toast } from "./toast.js";
+import { fill, h, words } from "../dom.js";
+import { icon } from "../icons.js";
+import { toast } from "../toast.js";
+import { align, distribute, layOut } from "./arrange.js";
+import { events, variables } from "./declared.js";
+import { around, groups, within } from "./macros.js";
+import { readValue, writeValue } from "./values.js";
 
 const KINDS = ["action", "resource", "control", "macro"];
 const ENDS = { normal: "normal: the run is done", error: "error: the run ended in error", preempt: "preempt: end a run that still goes on", going: "going: only while the run goes on" };
 const COUNTS = ["success", "failure", "error", "none"];
 const VALUE_HINT = "a number, \"text\", true, or $variable";
-
-/** A value as a person writes it: $name is a variable, everything else JSON or plain text. */
-export function readValue(text) {
-  const trimmed = text.trim();
-  if (trimmed.startsWith("$")) return { var: trimmed.slice(1) };
-  try {
-    return JSON.parse(trimmed);
-  } catch {
-    return trimmed;
-  }
-}
-
-export const writeValue = (value) => (value && typeof value === "object" && typeof value.var === "string" ? `$${value.var}` : typeof value === "string" && !/^[\d$"[{]|^(true|false|null)$/.test(value) ? value : JSON.stringify(value));
 
 export class Inspector {
   constructor(designer) {
@@ -82,7 +73,7 @@ export class Inspector {
   }
 
   findings(name) {
-    const list = this.designer.findingsOf(name);
+    const list = this.designer.findings.of(name);
     return list.length ? h("ul", { class: "faults" }, list.map((f) => h("li", { class: f.severity }, icon(f.severity === "error" ? "error" : "warning"), h("span", {}, f.text, f.remedy ? h("em", {}, f.remedy) : null)))) : null;
   }
 
@@ -96,7 +87,19 @@ export class Inspector {
       place.kind === "action" ? this.field("Runs at once", this.number(place.servers, (n) => set({ servers: n }), { min: 1, placeholder: "1" })) : this.field("Capacity", this.number(place.capacity, (n) => set({ capacity: n }), { min: 1, placeholder: "unlimited" })),
     ];
     const own = place.kind === "action" ? this.actionFields(name, place) : place.kind === "macro" ? this.macroFields(name, place) : [];
-    return [this.head(`${place.kind} place`, place.label || name), this.name(name), this.label(name, place), kind, own, h("div", { class: "two" }, common)];
+    const holds = place.kind === "macro" ? null : h("div", { class: "two" }, common);
+    return [this.head(`${place.kind} place`, place.label || name), this.name(name), this.label(name, place), kind, own, holds, this.macro(name, place)];
+  }
+
+  /** Within which macro place an element is drawn, where there is one to choose. */
+  macro(name, element) {
+    const { net } = this.model;
+    const free = Object.entries(net.places ?? {}).filter(([n, p]) => groups(p) && n !== name && !around(net, n).includes(name)).map(([n, p]) => [n, words(p.label || n)]);
+    return free.length ? this.field("Drawn in macro place", this.choice(element.macro ?? "", [["", "none"], ...free], (macro) => this.model.set(name, { macro }))) : null;
+  }
+
+  focusName() {
+    this.root.querySelector("input.name")?.focus();
   }
 
   label(name, element) {
@@ -113,7 +116,7 @@ export class Inspector {
     };
     const options = [["", "choose …"], ...[...known].sort().map((p) => [p, label(p)])];
     const exits = new Set(this.designer.picture.arcs.filter((a) => a.direction === "in" && a.place === name).map((a) => a.end));
-    const add = (end, text) => (exits.has(end) ? null : h("button", { type: "button", class: "small", onclick: () => this.designer.addExit(name, end) }, icon("plus"), text));
+    const add = (end, text) => (exits.has(end) ? null : h("button", { type: "button", class: "small", onclick: () => this.designer.tools.addExit(name, end) }, icon("plus"), text));
     const primitive = data.primitive_tasks?.[place.task];
     return [
       this.field("Primitive task", this.choice(place.task, options, (p) => p && this.model.choosePrimitiveTask(name, p, offers))),
@@ -159,11 +162,25 @@ export class Inspector {
 
   macroFields(name, place) {
     const subnets = Object.keys(this.model.data.subnets ?? {});
+    const inside = within(this.model.net, name).length;
+    if (!place.subnet && (inside || !subnets.length)) return this.groupFields(name, inside);
     return [
       this.field("Subnet", this.choice(place.subnet, [["", "choose …"], ...subnets.map((n) => [n, words(n)])], (n) => this.model.set(name, { subnet: n }))),
       h("div", { class: "buttons" },
         place.subnet ? h("button", { type: "button", class: "small", onclick: () => this.designer.openSheet(place.subnet) }, icon("open"), "Open") : null,
+        place.subnet ? null : h("button", { type: "button", class: "small", onclick: () => this.designer.openSheet(this.model.sheet, name) }, icon("open"), "Draw inside"),
         h("button", { type: "button", class: "small", onclick: () => this.designer.openSheet(this.model.addSubnet(name)) }, icon("plus"), "New subnet")),
+    ];
+  }
+
+  groupFields(name, inside) {
+    const { designer } = this;
+    return [
+      h("p", { class: "muted" }, inside ? `Shows ${inside} ${inside === 1 ? "element" : "elements"} as one place; its tokens are theirs.` : "Nothing is inside it yet: open it and draw."),
+      h("div", { class: "buttons" },
+        h("button", { type: "button", class: "small", onclick: () => designer.openSheet(this.model.sheet, name) }, icon("open"), "Open"),
+        inside ? h("button", { type: "button", class: "small", onclick: () => designer.ungroup() }, icon("close"), "Ungroup") : null,
+        inside ? null : h("button", { type: "button", class: "small", onclick: () => designer.openSheet(this.model.addSubnet(name)) }, icon("plus"), "New subnet")),
     ];
   }
 
@@ -183,6 +200,7 @@ export class Inspector {
       this.field("After (s)", this.number(t.after, (after) => set({ after }), { min: 0, step: "any", placeholder: "no timer" })),
       h("div", { class: "two" }, this.field("Priority", this.number(t.priority, (n) => set({ priority: n || null }), { placeholder: "0" })), this.field("Weight", this.number(t.weight, (weight) => set({ weight }), { min: 0, step: "any", placeholder: "none" }))),
       h("label", { class: "tick" }, h("input", { type: "checkbox", checked: Boolean(t.error_branch), onchange: (e) => set({ error_branch: e.target.checked || null }) }), "belongs to an error branch"),
+      this.macro(name, t),
     ];
   }
 
@@ -206,6 +224,7 @@ export class Inspector {
   arc(arc) {
     const set = (change) => this.designer.changeArc(arc, change);
     const kind = this.model.place(arc.place)?.kind;
+    if (arc.inner?.length) return this.innerArcs(arc);
     const fromAction = arc.direction === "in" && ["action", "macro"].includes(kind);
     const ends = Object.entries(ENDS).filter(([key]) => kind === "action" || key === "normal" || key === "error");
     return [
@@ -217,12 +236,22 @@ export class Inspector {
     ];
   }
 
+  /** An arc of a macro place stands for arcs of the places inside it. */
+  innerArcs(arc) {
+    return [
+      h("h2", {}, h("span", { class: "kind" }, arc.inner.length > 1 ? `${arc.inner.length} arcs` : "Arc"), `${words(arc.transition)} with ${arc.inner.map(words).join(", ")}`),
+      h("div", { class: "buttons" },
+        h("button", { type: "button", class: "small", onclick: () => this.designer.openSheet(this.model.sheet, arc.place) }, icon("open"), "Open the macro place"),
+        h("button", { type: "button", class: "small", onclick: () => this.designer.removeChosen() }, icon("trash"), "Delete")),
+    ];
+  }
+
   several(names) {
     const { designer } = this;
     const button = (name, label, act) => h("button", { type: "button", class: "small", onclick: act }, icon(name), label);
     return [
       h("h2", {}, `${names.size} elements`),
-      h("div", { class: "buttons" }, button("alignRow", "Align in a row", () => designer.align("y")), button("alignLeft", "Align in a column", () => designer.align("x")), button("distribute", "Space evenly", () => designer.distribute()), button("copy", "Copy", () => designer.copy()), button("trash", "Delete", () => designer.removeChosen())),
+      h("div", { class: "buttons" }, button("alignRow", "Align in a row", () => align(designer, "y")), button("alignLeft", "Align in a column", () => align(designer, "x")), button("distribute", "Space evenly", () => distribute(designer)), button("layout", "Lay out", () => layOut(designer)), button("macro", "Group into a macro place", () => designer.group()), button("copy", "Copy", () => designer.copy()), button("trash", "Delete", () => designer.removeChosen())),
     ];
   }
 
@@ -244,6 +273,7 @@ export class Inspector {
       this.field("Ends when", this.input(task?.final, (v) => set("final", v), { placeholder: "runs == 0 and arm_free == 1" }), "a condition on the tokens of places"),
       this.field("Gives up when", this.input(task?.final_error, (v) => set("final_error", v), { placeholder: "never" })),
       this.field("Remaining runs in", this.choice(task?.runs_place, [["", "no place"], ...controls], (v) => set("runs_place", v))),
+      events(this), variables(this),
       h("p", { class: "muted" }, "Choose an element to see its properties. Press ? for the keyboard."),
     ];
   }

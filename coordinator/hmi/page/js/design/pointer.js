@@ -1,8 +1,7 @@
 // The mouse in the designer: place, connect, drag with snapping, choose by a band.
 
-import { attribute, s } from "./dom.js";
-import { border } from "./geometry.js";
-import { snap } from "./designer.js";
+import { attribute, s } from "../dom.js";
+import { border, snap } from "../geometry.js";
 
 const NEAR = 7;
 const MOVED = 4;
@@ -15,6 +14,11 @@ export class Pointer {
     addEventListener("keyup", (e) => e.code === "Space" && (this.space = false));
   }
 
+  /** End what goes on without any effect: the drawing was altered under the pointer. */
+  stop() {
+    this.cancel?.();
+  }
+
   get view() {
     return this.designer.view;
   }
@@ -25,9 +29,10 @@ export class Pointer {
     if (event.button === 1 || this.space) return false;
     const element = view.elementAt(event.target);
     view.svg.focus({ preventScroll: true });
-    if (designer.tool === "arc" || designer.tool === "inhibit") return this.arcDown(event, element);
-    if (designer.tool !== "select") {
-      designer.insertNear(designer.tool, ...view.at(event.clientX, event.clientY));
+    const { tools } = designer;
+    if (tools.draws) return this.arcDown(event, element);
+    if (tools.tool !== "select") {
+      tools.insertNear(tools.tool, ...view.at(event.clientX, event.clientY));
       return true;
     }
     const arc = event.target.closest?.("[data-arc]");
@@ -38,35 +43,37 @@ export class Pointer {
   }
 
   follow(event, move, end) {
-    const { svg } = this.view;
+    const { view } = this;
+    const { svg } = view;
     svg.setPointerCapture(event.pointerId);
-    const up = (e) => {
-      svg.removeEventListener("pointermove", move);
-      svg.removeEventListener("pointerup", up);
-      svg.removeEventListener("pointercancel", up);
+    const over = new AbortController();
+    this.cancel = () => {
+      over.abort();
       this.cancel = null;
+      view.layers.over.replaceChildren();
+    };
+    const up = (e) => {
+      this.cancel?.();
       end(e);
     };
-    svg.addEventListener("pointermove", move);
-    svg.addEventListener("pointerup", up);
-    svg.addEventListener("pointercancel", up);
+    svg.addEventListener("pointermove", move, { signal: over.signal });
+    for (const kind of ["pointerup", "pointercancel"]) svg.addEventListener(kind, up, { signal: over.signal });
   }
 
   // ---- arcs ---------------------------------------------------------------------------------------------------------
 
   arcDown(event, element) {
     const { designer, view } = this;
+    const { tools } = designer;
     if (!element) {
-      if (designer.arcFrom) this.arcTo(null, event);
+      if (tools.arcFrom) this.arcTo(null, event);
       return true;
     }
-    if (designer.arcFrom && designer.arcFrom !== element.name) {
+    if (tools.arcFrom && tools.arcFrom !== element.name) {
       this.arcTo(element.name, event);
       return true;
     }
-    designer.arcFrom = element.name;
-    view.only("target", new Set([element.name]));
-    designer.tell(`From ${element.name}: choose where the arc goes.`);
+    tools.from(element.name, `From ${element.name}: choose where the arc goes.`);
     const line = s("path", { class: "draft" });
     view.layers.over.append(line);
     let far = false;
@@ -86,18 +93,18 @@ export class Pointer {
   }
 
   /** End an arc at an element, or at a new one of the other kind where nothing stands. */
-  arcTo(name, event) {
+  async arcTo(name, event) {
     const { designer, view } = this;
-    const from = designer.arcFrom;
-    const kept = designer.tool;
+    const from = designer.tools.arcFrom;
+    const kept = designer.tools.tool;
     let to = name;
     if (!to) {
       const [x, y] = view.at(event.clientX, event.clientY);
       const isPlace = Boolean(designer.model.place(from));
       to = isPlace ? designer.model.addTransition(snap(x), snap(y)) : designer.model.addPlace("action", snap(x), snap(y));
     }
-    designer.connect(from, to);
-    designer.use(kept);
+    await designer.connect(from, to);
+    designer.tools.use(kept);
     designer.choose(new Set([to]));
   }
 
@@ -109,7 +116,8 @@ export class Pointer {
     if (!designer.selection.names.has(element.name)) designer.choose(new Set([element.name]));
     view.focusable(element.name);
     const [x0, y0] = view.at(event.clientX, event.clientY);
-    const moved = new Map([...designer.selection.names].map((n) => view.elements.get(n)).filter(Boolean).map((e) => [e.name, { x: e.x, y: e.y }]));
+    const moved = new Map([...designer.selection.names].map((n) => view.elements.get(n)).filter((e) => e && !e.outside).map((e) => [e.name, { x: e.x, y: e.y }]));
+    if (!moved.has(element.name)) return designer.choose(new Set([element.name]));
     const others = [...view.elements.values()].filter((e) => !moved.has(e.name) && !view.isFolded(e));
     let going = false;
     let positions = null;
@@ -161,8 +169,7 @@ export class Pointer {
       const [left, top, right, bottom] = [Math.min(x, x0), Math.min(y, y0), Math.max(x, x0), Math.max(y, y0)];
       for (const [key, value] of Object.entries({ x: left, y: top, width: right - left, height: bottom - top, visibility: "visible" })) box.setAttribute(key, value);
       const inside = [...view.elements.values()].filter((el) => !view.isFolded(el) && el.x >= left && el.x <= right && el.y >= top && el.y <= bottom);
-      designer.selection = { names: new Set([...kept, ...inside.map((el) => el.name)]), arc: null };
-      designer.paintSelection();
+      designer.selected.choose(new Set([...kept, ...inside.map((el) => el.name)]));
     }, () => {
       box.remove();
       designer.choose(designer.selection.names);

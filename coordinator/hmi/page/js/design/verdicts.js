@@ -1,8 +1,9 @@
 // What the analysis says of the task that is drawn: verdicts, the firings that speak against it, and where its time goes.
 
-import { attribute, fill, h, s } from "./dom.js";
-import { analyseDocument } from "./files.js";
-import { icon } from "./icons.js";
+import { attribute, fill, h, s } from "../dom.js";
+import { analyseDocument } from "../files.js";
+import { icon } from "../icons.js";
+import { around, groups } from "./macros.js";
 
 const SETTLED_MS = 1500;
 const SIGN = { true: "check", false: "error", null: "info" };
@@ -89,7 +90,9 @@ export class Verdicts {
     const witness = this.shown?.witness;
     const turns = new Map();
     [...(witness?.firings ?? []), ...(witness?.loop ?? [])].forEach((name, i) => turns.set(name, [...(turns.get(name) ?? []), i + 1]));
-    const inside = (name) => Object.entries(witness.marking).reduce((sum, [place, n]) => sum + (place === name || place.startsWith(`${name}.`) ? n : 0), 0);
+    const { net } = this.designer.model;
+    const covers = (name, place) => place === name || around(net, place.split(".")[0]).includes(name) || (place.startsWith(`${name}.`) && !groups(net.places?.[name]));
+    const inside = (name) => Object.entries(witness.marking).reduce((sum, [place, n]) => sum + (covers(name, place) ? n : 0), 0);
     for (const place of picture.places) view.tokens(place.name, witness ? inside(place.name) : place.tokens);
     for (const element of view.elements.values()) {
       const share = this.hot ? this.heat[element.name] : undefined;

@@ -1,0 +1,56 @@
+// The bar over the drawing: which task is on the desk, whether it is saved, and buttons for what keys do, too.
+
+import { tool } from "../canvas.js";
+import { attribute, fill, h, text, words } from "../dom.js";
+import { icon } from "../icons.js";
+import { layOut } from "./arrange.js";
+
+const FORMS = [["", "Import, export"], ["in", "Import PNML or TOML"], ["svg", "Export SVG"], ["png", "Export PNG"], ["pnml", "Export PNML"], ["toml", "Export TOML"]];
+
+export class Bar {
+  constructor(designer) {
+    this.designer = designer;
+    const { desk } = designer;
+    this.picker = h("select", { "aria-label": "Task", onchange: () => desk.pick(this.picker.value) });
+    this.state = h("span", { class: "saved", role: "status" });
+    this.undo = tool("undo", "Undo", () => designer.undo());
+    this.redo = tool("redo", "Redo", () => designer.redo());
+    this.more = h("select", { "aria-label": "Import and export", onchange: () => this.exchange() }, FORMS.map(([v, t]) => h("option", { value: v }, t)));
+    this.root = h("div", { class: "design-bar", role: "toolbar", "aria-label": "Task file" },
+      this.picker, tool("plus", "New task", () => desk.begin()),
+      h("button", { type: "button", class: "small", onclick: () => desk.save() }, icon("save"), "Save"), this.state,
+      h("div", { class: "gap" }), this.undo, this.redo,
+      tool("copy", "Copy", () => designer.copy()), tool("paste", "Paste", () => designer.paste()), tool("trash", "Delete", () => designer.removeChosen()),
+      h("button", { type: "button", class: "small", onclick: () => layOut(designer) }, icon("layout"), "Layout"),
+      this.more, desk.file, tool("info", "Keyboard", () => designer.help.open()), h("div", { class: "spacer" }),
+      h("button", { type: "button", class: "command primary", onclick: () => desk.run() }, icon("play"), "Run this task"));
+  }
+
+  exchange() {
+    const form = this.more.value;
+    this.more.value = "";
+    return this.designer.desk.exchange(form);
+  }
+
+  /** Show the tasks that there are; a new one that is not among them yet stands first. */
+  list(tasks) {
+    const { model } = this.designer;
+    const names = tasks.map((t) => t.name);
+    const whose = new Map(tasks.map((t) => [t.name, t.own === false ? " (shipped)" : t.shipped ? " (my copy)" : ""]));
+    const own = model.name && !names.includes(model.name) ? [model.name] : [];
+    fill(this.picker, model.name ? null : h("option", { value: "" }, "(new task)"), [...own, ...names].map((n) => h("option", { value: n }, `${words(n)}${whose.get(n) ?? ""}`)));
+    this.picker.value = model.name;
+  }
+
+  /** Show what is on the desk, and what undo would take back. */
+  paint() {
+    const { model, desk } = this.designer;
+    this.picker.value = model.name;
+    text(this.state, model.dirty ? "not saved" : !model.name ? "" : desk.isShipped ? "shipped, saving makes your copy" : "saved");
+    attribute(this.state, "data-dirty", model.dirty ? "" : null);
+    for (const [button, states, word] of [[this.undo, model.past, "Undo"], [this.redo, model.future, "Redo"]]) {
+      button.disabled = !states.length;
+      attribute(button, "title", states.length ? `${word}: ${states.at(-1).label}` : word);
+    }
+  }
+}

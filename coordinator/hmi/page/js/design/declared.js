@@ -1,0 +1,60 @@
+// What a task declares beside its net: events and variables, as forms of the task's own properties.
+
+import { h, words } from "../dom.js";
+import { icon } from "../icons.js";
+import { toast } from "../toast.js";
+import { readValue, writeValue } from "./values.js";
+
+const NAME = /^[\p{L}_][\p{L}\p{N}_]*$/u;
+const TYPES = ["bool", "int", "float", "str", "any"].map((t) => [t, t]);
+const MEMORY = [["pulse", "pulse: for who is ready when it comes"], ["latched", "latched: a flag until it is used"]];
+
+/** A fieldset with a row for each entry of a table of the document, and one for a new name. */
+function table(form, title, key, row, fresh) {
+  const { model } = form;
+  const one = title.toLowerCase().replace(/s$/, "");
+  const name = h("input", { placeholder: `new ${one}`, "aria-label": `New ${one}`, onkeydown: (e) => { e.stopPropagation(); if (e.key === "Enter") add(); } });
+  const add = () => {
+    const wanted = name.value.trim().replaceAll(" ", "_");
+    if (!NAME.test(wanted)) return toast("warning", "A name begins with a letter and has letters, digits and _ only.");
+    if (model.data[key]?.[wanted]) return toast("warning", `There is already a ${one} called ${wanted}.`);
+    return model.edit(`add ${one}`, (data) => ((data[key] ??= {})[wanted] = { ...fresh }));
+  };
+  const remove = (entry) => model.edit(`delete ${one}`, (data) => delete data[key][entry]);
+  const rows = Object.entries(model.data[key] ?? {}).map(([entry, value]) =>
+    h("div", { class: "declared", role: "group", "aria-label": `${one} ${words(entry)}` }, h("span", { class: "chip" }, words(entry)), row(entry, value), h("button", { type: "button", class: "tool", "aria-label": `Delete ${one} ${words(entry)}`, onclick: () => remove(entry) }, icon("trash"))));
+  return h("fieldset", {}, h("legend", {}, title), rows, h("div", { class: "row" }, name, h("button", { type: "button", class: "small", "aria-label": `Add ${one}`, onclick: add }, icon("plus"), "Add")));
+}
+
+const setter = (form, key, entry, label) => (field, value) => form.model.edit(label, (data) => {
+  if (value === "" || value === null) delete data[key][entry][field];
+  else data[key][entry][field] = value;
+});
+
+/** The task's events. */
+export function events(form) {
+  const primitives = Object.keys(form.model.data.primitive_tasks ?? {}).map((p) => [p, `int, by ${words(p)}`]);
+  return table(form, "Events", "events", (entry, event) => {
+    const set = setter(form, "events", entry, "change event");
+    const source = (value) => form.model.edit("change event", (data) => {
+      const { text, mean_wait: wait } = data.events[entry];
+      data.events[entry] = { ...(value ? { scope: "internal", by: value } : { scope: "external" }), ...(text ? { text } : {}), ...(wait && !value ? { mean_wait: wait } : {}) };
+    });
+    return [
+      form.choice(event.scope === "internal" ? event.by : "", [["", "external"], ...primitives], source, { "aria-label": `Where ${words(entry)} comes from` }),
+      event.scope === "internal" ? null : form.choice(event.memory ?? "pulse", MEMORY, (memory) => set("memory", memory), { "aria-label": `How ${words(entry)} is remembered` }),
+    ];
+  }, { scope: "external" });
+}
+
+/** The task's variables, which conditions and arguments read. */
+export function variables(form) {
+  return table(form, "Variables", "variables", (entry, variable) => {
+    const set = setter(form, "variables", entry, "change variable");
+    const initial = "initial" in variable ? writeValue(variable.initial) : "";
+    return [
+      form.choice(variable.type ?? "any", TYPES, (type) => set("type", type), { "aria-label": `Type of ${words(entry)}` }),
+      form.input(initial, (text) => set("initial", text.trim() === "" ? null : variable.type === "str" ? text : readValue(text)), { placeholder: "initial", "aria-label": `Initial value of ${words(entry)}` }),
+    ];
+  }, { type: "bool", initial: false });
+}

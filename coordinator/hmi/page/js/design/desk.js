@@ -1,0 +1,137 @@
+// The task file on the desk: open, begin anew, save, import and export, with nothing lost on the way.
+
+import { openDialog } from "../dialog.js";
+import { h } from "../dom.js";
+import { askName, exportAs, importNet, listTasks, openTask, saveTask } from "../files.js";
+import { toast } from "../toast.js";
+import { emptyDocument } from "./model.js";
+
+export class Desk {
+  constructor(designer) {
+    Object.assign(this, { designer, documents: 0, isShipped: false });
+    this.file = h("input", { type: "file", accept: ".pnml,.xml,.toml", hidden: true, "aria-label": "File to import", onchange: () => this.importFile() });
+  }
+
+  get model() {
+    return this.designer.model;
+  }
+
+  /** Put a document on the desk in the place of what lay there. */
+  put(task, isShipped = false) {
+    this.documents += 1;
+    this.isShipped = isShipped;
+    this.model.load(task);
+  }
+
+  /** The first time that the designer is shown: the task that runs, or the first one, unless something else was begun. */
+  async first() {
+    const tasks = await this.refresh();
+    if (this.everShown || this.documents) return;
+    this.everShown = true;
+    const running = this.designer.link.state.task?.name;
+    const known = tasks.map((t) => t.name);
+    if (known.length) await this.open(known.includes(running) ? running : known[0]);
+    else this.designer.view.fit();
+  }
+
+  async refresh() {
+    const tasks = await listTasks();
+    this.designer.bar.list(tasks);
+    return tasks;
+  }
+
+  /** Open a task; of several documents asked for, the last one is shown whichever answer comes last. */
+  async open(name) {
+    const asked = ++this.documents;
+    const task = await openTask(name);
+    if (asked !== this.documents) return;
+    if (!task) {
+      this.designer.bar.paint(); // what was open stays, and so does its name
+      return;
+    }
+    this.put(task, task.own === false);
+    this.designer.findings.take(task);
+    await this.refresh();
+    this.designer.view.fit();
+  }
+
+  async pick(wanted) {
+    if (!(await this.mayLeave())) this.designer.bar.paint();
+    else if (wanted) await this.open(wanted);
+  }
+
+  async begin() {
+    if (!(await this.mayLeave())) return;
+    this.put({ name: "", revision: null, document: emptyDocument("new_task") });
+    this.refresh();
+    this.designer.view.look(0, 0, 1);
+  }
+
+  /** Whether what is on the desk may be put away; asks when it is not saved. */
+  mayLeave() {
+    if (!this.model.dirty) return Promise.resolve(true);
+    const question = "Leave without saving?";
+    return new Promise((resolve) => {
+      const end = (answer) => {
+        dialog.close();
+        resolve(answer);
+      };
+      const dialog = h("dialog", { "aria-label": question }, h("h2", {}, question), h("p", { class: "muted" }, "There are changes that are not saved."),
+        h("div", { class: "buttons" }, h("button", { type: "button", class: "small", onclick: () => end(false) }, "Stay"), h("button", { type: "button", class: "command danger", onclick: () => end(true) }, "Leave")));
+      dialog.addEventListener("cancel", () => end(false));
+      openDialog(dialog);
+    });
+  }
+
+  /** Save one after the other: a second press while the first is on its way waits for it. */
+  save() {
+    this.saving = (this.saving ?? Promise.resolve()).then(() => this.saveNow(), () => this.saveNow());
+    return this.saving;
+  }
+
+  async saveNow() {
+    const { model } = this;
+    const name = model.name || (await askName("Save the task as", model.data.task?.name ?? "new_task"));
+    if (!name) return false;
+    if (!model.name && model.data.task?.name === "new_task") model.edit("name", (data) => (data.task.name = name));
+    const sent = { data: model.data, renames: model.renames };
+    const { documents } = this;
+    const saved = await saveTask(model, name);
+    if (!saved || documents !== this.documents) return false;
+    this.isShipped = saved.own === false;
+    if (saved.reload) model.load(saved);
+    else model.savedAs(saved, sent);
+    this.designer.findings.take(saved);
+    await this.refresh();
+    toast("ok", saved.reload ? "Loaded their version" : "Saved");
+    return !saved.reload;
+  }
+
+  /** Save what is drawn and start it. */
+  async run() {
+    if ((this.model.dirty || !this.model.name) && !(await this.save())) return;
+    if (this.designer.findings.errors) {
+      toast("error", "The task has faults: they are listed below the drawing.");
+      return;
+    }
+    const answer = await this.designer.operator.give("start", { task: this.model.name });
+    if (answer.ok) location.hash = "#Live";
+  }
+
+  async exchange(form) {
+    if (form === "in") this.file.click();
+    else if (form) await exportAs(form, this.model, this.designer.view, this.designer.findings.text);
+  }
+
+  async importFile() {
+    const [file] = this.file.files;
+    this.file.value = "";
+    if (!file || !(await this.mayLeave())) return;
+    const made = await importNet(file.name.endsWith(".toml") ? "toml" : "pnml", await file.text());
+    if (!made) return;
+    this.put({ name: "", revision: null, document: made.document });
+    await this.refresh();
+    this.designer.view.fit();
+    toast("ok", `Imported ${file.name}; it is not saved yet`);
+  }
+}
