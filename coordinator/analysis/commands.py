@@ -6,9 +6,9 @@ come from the caller, too.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,8 @@ from coordinator.analysis.gspn import Gspn
 from coordinator.analysis.netfile import FormatError, NetFile
 from coordinator.analysis.ordinary import OrdinaryView
 from coordinator.analysis.picture import graph_svg
-from coordinator.analysis.report import Analysis, analyse
+from coordinator.analysis.rates import read_rates, unit_rates
+from coordinator.analysis.report import CUT, Analysis, analyse
 from coordinator.analysis.simulate import Estimate, Simulation, goal_by_marking, simulate
 from coordinator.analysis.space import EngineName, Limits, explore
 from coordinator.analysis.stochastic import Measured, NoEstimate, stochastic_view
@@ -48,44 +49,11 @@ def open_model(path: Path, load_task: LoadTask) -> Task | NetFile:
     return load_task(path) if path.suffix == ".toml" else read_net(path)
 
 
-def read_rates(text: str, file: str, model: NetFile) -> Gspn:
-    """A GSPN from a rates file (TOML): `[rates]` transition = 1/s, `[weights]`, `[servers]` (a number or "infinite"),
-    and `default_rate` for every transition that is not named. Raises FormatError.
-    """
-    try:
-        said = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise FormatError(file, "TOML", str(error)) from error
-    unknown = set(said) - {"rates", "weights", "servers", "default_rate"}
-    if unknown:
-        raise FormatError(file, min(unknown), "an unknown key", "known are rates, weights, servers, default_rate")
-    rates, weights = (_numbers(said.get(key, {}), file, key) for key in ("rates", "weights"))
-    servers = {name: None if n == "infinite" else n for name, n in said.get("servers", {}).items()}
-    if "default_rate" in said:
-        missing = [t for t in model.net.transitions if t not in rates and t not in weights]
-        rates |= dict.fromkeys(missing, float(said["default_rate"]))
-    try:
-        return Gspn.of(model.net, rates, weights=weights, servers=servers)
-    except (ValueError, TypeError) as error:
-        raise FormatError(file, "rates", str(error)) from error
-
-
-def _numbers(table: Any, file: str, key: str) -> dict[str, float]:
-    if not isinstance(table, dict) or not all(isinstance(v, int | float) for v in table.values()):
-        raise FormatError(file, key, "no table of numbers", f"write [{key}] and TRANSITION = NUMBER below it")
-    return {name: float(value) for name, value in table.items()}
-
-
-def unit_rates(model: NetFile) -> Gspn:
-    """Every transition with rate 1/s and one server."""
-    return Gspn.of(model.net, dict.fromkeys(model.net.transitions, 1.0))
-
-
 def analyse_command(
     path: Path,
     load_task: LoadTask,
     *,
-    view: str = "ordinary",
+    view: str | None = None,
     rates: Path | str | None = None,
     stages: int = 8,
     limits: Limits | None = None,
@@ -95,29 +63,57 @@ def analyse_command(
 ) -> Outcome:
     """`petrobot analyse`: code 0 if bounded and free from deadlock, 1 if not (or unknown), 2 for bad input.
 
-    `rates` is a rates file, or "unit"; rates found in the net file itself are used when `view` is "gspn". `changes` (see
-    `whatif`) are judged beside the file as it is: the code and the text are those of what would be.
+    `rates` is a rates file, or "unit". Without a `view` a net with rates, given here or found in its file, is analysed as
+    "gspn", all else as "ordinary". `changes` (see `whatif`) are judged beside the file as it is: the code and the text are
+    those of what would be.
     """
-
-    def found(subject: Subject, measured: Measured | None) -> Analysis:
-        return analyse(subject, name=name or path.stem, view=view, measured=measured, stages=stages, limits=limits,
-                       engine=engine)  # fmt: skip
-
     try:
         model = open_model(path, load_task)
+        view = view or _view(model, rates)
         subject, name, notes = _subject(model, rates, view)
-        now = found(subject, None)
         wanted = [read_change(text) for text in changes]
-        then = found(*_changed(subject, wanted)) if wanted else now
-    except FormatError as error:
-        return Outcome(BAD_INPUT, str(error), {"error": str(error)})
-    data = then.to_json(structure=structure)
-    said = [then.text(), *(f"note: {note}" for note in notes)]
+        altered = _changed(subject, wanted) if wanted else None
+        plain = model.net if isinstance(model, NetFile) and rates is not None else None
+
+        def found(one: Subject, measured: Measured | None) -> Analysis:
+            tokens = plain and (change_net(plain, _tokens_of(plain, wanted)) if one is not subject else plain)
+            return analyse(one, name=name or path.stem, view=view, measured=measured, stages=stages, limits=limits,
+                           engine=engine, ordinary=tokens)  # fmt: skip
+
+        now = found(subject, None)
+        then = found(*altered) if altered else now
+    except (FormatError, ValueError, OverflowError) as error:
+        return Outcome(BAD_INPUT, _named(path, error), {"error": _named(path, error)})
+    then, data, said = _told(then, structure)
     if wanted:
         what = [change.text for change in wanted]
         data |= {"what_if": what, "as_it_is": now.to_json(structure=False)}
         said += ["", f"what if {', '.join(what)}:", *_compared(now, then)]
+    said += [f"note: {note}" for note in notes]
     return Outcome(OK if then.ok else FAULT, "\n".join(said), data | {"notes": [*data["notes"], *notes]}, analysis=then)
+
+
+def _view(model: Task | NetFile, rates: Path | str | None) -> str:
+    """What is asked for where nobody says: numbers wherever there are rates."""
+    return "gspn" if isinstance(model, NetFile) and (rates is not None or model.gspn is not None) else "ordinary"
+
+
+def _named(path: Path, error: Exception) -> str:
+    return str(error) if isinstance(error, FormatError) else f"{path}: {error}"
+
+
+def _tokens_of(net: Net, changes: Sequence[Change]) -> list[Change]:
+    """The changes that concern tokens."""
+    return [change for change in changes if ".".join(change.subject) in net.place_index]
+
+
+def _told(found: Analysis, structure: bool) -> tuple[Analysis, dict[str, Any], list[str]]:
+    """The analysis with its data and text; Ctrl-C leaves out what the arcs alone say, then the numbers."""
+    try:
+        return found, found.to_json(structure=structure), [found.text()]
+    except KeyboardInterrupt:
+        part = replace(found, interrupted=True, forecast=None, notes=tuple(dict.fromkeys((*found.notes, CUT))))
+        return part, part.to_json(structure=False), [part.text()]
 
 
 Subject = Task | Net | Gspn
@@ -200,13 +196,14 @@ def simulate_command(
             gspn, random, replicas=replicas, horizon=horizon, warmup=warmup, firings=firings, progress=progress
         )
         return _simulated(name or path.stem, seen, notes)
-    except (FormatError, NoEstimate, ValueError, KeyError) as error:
-        return Outcome(BAD_INPUT, str(error), {"error": str(error)})
+    except (FormatError, NoEstimate, ValueError, KeyError, OverflowError, MemoryError) as error:
+        told = _named(path, error) if not isinstance(error, MemoryError) else f"{path}: out of memory: fewer --replicas"
+        return Outcome(BAD_INPUT, told, {"error": told})
 
 
 def _simulated(name: str, seen: Simulation, notes: tuple[str, ...]) -> Outcome:
-    def plain(one: Estimate) -> list[float]:
-        return [one.mean, one.low, one.high]
+    def plain(one: Estimate) -> list[float | None]:
+        return [x if isfinite(x) else None for x in (one.mean, one.low, one.high)]
 
     data: dict[str, Any] = {
         "name": name,
@@ -244,8 +241,8 @@ def convert_command(source: Path, target: Path, load_task: LoadTask, *, stages: 
             lost = list(model.notes)
         text, more = written(model, target.suffix)
         target.write_text(text, encoding="utf-8")
-    except (FormatError, NoEstimate) as error:
-        return Outcome(BAD_INPUT, str(error), {"error": str(error)})
+    except (FormatError, NoEstimate, ValueError, OverflowError) as error:
+        return Outcome(BAD_INPUT, _named(source, error), {"error": _named(source, error)})
     except OSError as error:
         return Outcome(BAD_INPUT, f"{target}: {error.strerror or error}", {"error": str(error)})
     lost += more
@@ -282,11 +279,10 @@ def graph_command(
     """`petrobot show --graph`: the reachability graph as SVG in data["svg"]; by default with the first deadlock's witness."""
     try:
         model = open_model(path, load_task)
-    except FormatError as error:
-        return Outcome(BAD_INPUT, str(error), {"error": str(error)})
-    net, final = model.net, None
-    limits = limits or Limits(states=10_000)
-    space = explore(net, limits=limits)
+        net, final = model.net, None
+        space = explore(net, limits=limits or Limits(states=10_000))
+    except (FormatError, ValueError, OverflowError) as error:
+        return Outcome(BAD_INPUT, _named(path, error), {"error": _named(path, error)})
     if isinstance(model, Task):
         final = space.where(OrdinaryView(model).is_end)
     stuck = [int(i) for i in space.dead if final is None or not final[i]]

@@ -23,6 +23,8 @@ OMEGA = -1
 """Stands for arbitrarily many tokens in a marking of the tree."""
 EFFORT = 20_000
 """Nodes of the tree at most."""
+COMPARISONS = 100
+"""Comparisons with ancestors at most, for each node that the effort allows: long chains of ancestors end the tree sooner."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +44,16 @@ class Coverability:
     prefix: tuple[str, ...] = ()
     pump: tuple[str, ...] = ()
     grows: tuple[str, ...] = ()
+    never: tuple[str, ...] = ()
+    """Transitions that a complete tree never fires: they are dead, priorities or not."""
+    exact: bool = False
+    """Whether every transition that is not in `never` can fire: the tree is complete and the net has no priorities."""
+
+
+def settle_bounds(net: Net, bounds: Sequence[int | None] | None = None, *, effort: int = EFFORT) -> Coverability:
+    """The complete tree where the effort suffices, else the first place that can grow without end."""
+    whole = coverability(net, effort=effort, bounds=bounds)
+    return whole if whole.complete else coverability(net, effort=effort, bounds=bounds, first_omega=True)
 
 
 def coverability(
@@ -70,14 +82,15 @@ def coverability(
 def _verdict(net: Net, tree: _Tree, first_omega: bool) -> Coverability:
     bounds = tree.bounds()
     prefix, pump, grows = tree.witness(net)
-    unbounded = tree.omega is not None
-    if unbounded and len(set(net.priority)) > 1:
+    unbounded, ranked = tree.omega is not None, len(set(net.priority)) > 1
+    complete = not (unbounded and first_omega)
+    never = tuple(name for t, name in enumerate(net.transitions) if t not in tree.fired) if complete else ()
+    if unbounded and ranked:
         reason = "unbounded without its priorities; with them it may be bounded"
-        return Coverability(None, bounds, reason, len(tree.nodes), not first_omega, prefix, pump, grows)
+        return Coverability(None, bounds, reason, len(tree.nodes), complete, prefix, pump, grows, never)
     reason = f"{', '.join(grows)} can grow without end" if unbounded else "no marking covers one of its ancestors"
-    return Coverability(
-        not unbounded, bounds, reason, len(tree.nodes), not (unbounded and first_omega), prefix, pump, grows
-    )
+    exact = complete and not ranked
+    return Coverability(not unbounded, bounds, reason, len(tree.nodes), complete, prefix, pump, grows, never, exact)
 
 
 def _complemented(net: Net, limits: Sequence[dict[int, int]], bounds: Sequence[int | None]) -> Net:
@@ -131,6 +144,8 @@ class _Tree:
         self.net, self.real = net, real
         self.nodes = [_Node(net.initial, -1, -1)]
         self.omega: int | None = None
+        self.fired: set[int] = set()
+        self.compared = 0
 
     def grow(self, effort: int, first_omega: bool) -> bool:
         """Build the tree; False if the effort ran out."""
@@ -145,8 +160,9 @@ class _Tree:
                 after = self._fire(self.nodes[i].marking, t)
                 if after is None:
                     continue
-                if len(self.nodes) >= effort:
+                if len(self.nodes) >= effort or self.compared > COMPARISONS * effort:
                     return False
+                self.fired.add(t)
                 self._add(i, t, after)
                 if self.omega is not None and first_omega:
                     return True
@@ -166,6 +182,7 @@ class _Tree:
         node, covered, up = _Node(after, parent, fired), after, parent
         while up >= 0:
             older = self.nodes[up].marking
+            self.compared += 1
             if older != covered and all(_at_least(a, b) for a, b in zip(covered, older, strict=True)):
                 wider = tuple(OMEGA if a != b else a for a, b in zip(covered, older, strict=True))
                 if wider != covered:

@@ -11,13 +11,13 @@ from coordinator.analysis.gspn import Chain
 from coordinator.analysis.netfile import FormatError, NetFile
 from coordinator.analysis.pnml_reading import parse_pnml
 
-READ: dict[str, Callable[[str, str], NetFile]] = {
+READ: dict[str, Callable[[bytes, str], NetFile]] = {
     ".pnml": parse_pnml,
     ".xml": parse_pnml,
     ".pnpro": parse_pnpro,
-    ".net": tina.parse_tina,
+    ".net": lambda text, file: tina.parse_tina(_utf8(text, file), file),
 }
-"""Readers by ending: `.xml` is what PIPE writes (PNML)."""
+"""Readers by ending: `.xml` is what PIPE writes (PNML). An XML file says its encoding itself."""
 WRITE = (".pnml", ".net", ".dot", ".drn")
 """Endings that can be written."""
 
@@ -28,10 +28,17 @@ def read_net(path: Path) -> NetFile:
     if reader is None:
         raise FormatError(str(path), "file", f"{path.suffix or 'no'} ending", f"known are {', '.join(READ)}")
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise FormatError(str(path), "file", str(error), "give a readable UTF-8 file") from error
+        text = path.read_bytes()
+    except OSError as error:
+        raise FormatError(str(path), "file", error.strerror or str(error), "give a readable file") from error
     return reader(text, str(path))
+
+
+def _utf8(text: bytes, file: str) -> str:
+    try:
+        return text.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise FormatError(file, "file", str(error), "give a UTF-8 file") from error
 
 
 def written(model: NetFile, ending: str) -> tuple[str, list[str]]:

@@ -41,8 +41,10 @@ def graph_svg(space: Space, *, witness: Sequence[str] = (), final: Mask | None =
     on = {(i, t) for i, t, _ in steps}
     visited = {0} | {j for _, _, j in steps} if steps else set()
     body = [*_edges(space, shown, at, on), *_nodes(space, shown, at, final, visited)]
-    if len(shown) < len(space):
-        body.append(f'<text x="20" y="{height - 10}" class="m">{len(shown)} of {len(space)} markings shown</text>')
+    if len(shown) < len(space) or not space.complete:
+        partial = "" if space.complete else f" (partial: {escape(space.reason)})"
+        told = f"{len(shown)} of {len(space)} markings shown{partial}"
+        body.append(f'<text x="20" y="{height - 10}" class="m">{told}</text>')
     head = '<marker id="head" viewBox="0 0 8 8" refX="8" refY="4" markerWidth="7" markerHeight="7" orient="auto"><path d="M0 0L8 4L0 8z" fill="#8c959f"/></marker>'  # noqa: E501
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}" role="img">'

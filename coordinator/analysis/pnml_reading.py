@@ -27,6 +27,9 @@ PLACE_TRANSITION = (
     "ptinhibitornet",
     "inhibitorptnet",
     "gspn",
+    "epnml-1.0",
+    "epnml-1.1",
+    "pnml-pt",
 )
 
 
@@ -38,6 +41,17 @@ def local(element: Element) -> str:
 def children(element: Element, tag: str) -> Iterator[Element]:
     """Children with a local tag."""
     return (child for child in element if local(child) == tag)
+
+
+def nodes(net: Element) -> Iterator[Element]:
+    """The objects of a net and of its pages, however deep. What else holds such tags (final markings, tool-specific data,
+    unfoldings) is none of them.
+    """
+    for child in net:
+        if local(child) == "page":
+            yield from nodes(child)
+        elif local(child) in ("place", "transition", "arc", "referencePlace", "referenceTransition"):
+            yield child
 
 
 def label(element: Element, tag: str) -> str | None:
@@ -69,14 +83,14 @@ def parse_pnml(text: str | bytes, file: str = "PNML") -> NetFile:
         problem = f"{len(nets)} nets" if nets else "no <net>"
         raise FormatError(file, "pnml", problem, "a file holds one net here: split it")
     (net,) = nets
-    kind = (net.get("type") or "").lower()
+    kind = (net.get("type") or "").strip().lower()
     if kind and not any(kind.rstrip("/").endswith(known) for known in PLACE_TRANSITION):
         raise FormatError(file, f"net {net.get('id')}", f"a net of type {net.get('type')!r}", "only P/T nets are read")
     return _Reading(net, file).result(root)
 
 
 def _tree(text: str | bytes, file: str) -> Element:
-    if ENTITY.search(text if isinstance(text, str) else text.decode("latin-1")):
+    if ENTITY.search(text if isinstance(text, str) else text.replace(b"\0", b"").decode("latin-1")):
         raise FormatError(
             file, "XML", "a PNML file that defines entities", "they can grow without bound: write them out"
         )
@@ -122,11 +136,11 @@ class _Reading:
         return NetFile(gspn.net if gspn else net, name, gspn, self.labels, self.positions, notes, root)
 
     def _nodes(self, tag: str) -> Iterator[Element]:
-        return (node for node in self.element.iter() if local(node) == tag)
+        return (node for node in nodes(self.element) if local(node) == tag)
 
     def _id(self, node: Element) -> str:
         name = node.get("id")
-        if not name:
+        if not name:  # an empty one names nothing either
             raise FormatError(self.file, local(node), "it has no id", "every node of PNML has one")
         return name
 

@@ -7,13 +7,14 @@ that reads the standard alone would miss.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from copy import deepcopy
 from itertools import count
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
 from coordinator.analysis.netfile import FormatError, NetFile
-from coordinator.analysis.pnml_reading import TOOL, arc_kind, children, local
+from coordinator.analysis.pnml_reading import TOOL, arc_kind, children, local, nodes
 
 NAMESPACE = "http://www.pnml.org/version-2009/grammar/pnml"
 TYPE = "http://www.pnml.org/version-2009/grammar/ptnet"
@@ -56,22 +57,30 @@ def _fresh(model: NetFile) -> Element:
     return root
 
 
+def _pages(net: Element) -> Iterator[Element]:
+    """The net and its pages, however deep: whatever holds nodes and arcs."""
+    yield net
+    for page in children(net, "page"):
+        yield from _pages(page)
+
+
 class _Writing:
     """A tree brought in line with a net."""
 
     def __init__(self, root: Element, model: NetFile) -> None:
         self.root, self.model, self.net = root, model, model.net
         self.element = root if local(root) == "net" else next(children(root, "net"))
-        self.page = next((node for node in self.element.iter() if local(node) == "page"), self.element)
+        self.parents = list(_pages(self.element))
+        self.page = self.parents[1] if len(self.parents) > 1 else self.element
         self.prefix = self.element.tag[: self.element.tag.index("}") + 1] if "}" in self.element.tag else ""
         self.references = {
-            node.get("id"): node.get("ref") for node in root.iter() if local(node).startswith("reference")
+            node.get("id"): node.get("ref") for node in nodes(self.element) if local(node).startswith("reference")
         }
 
     def update(self) -> None:
         """Remove what the net no longer has, set what it has, add what is new."""
         self._drop_missing()
-        known = {node.get("id"): node for node in self.element.iter() if local(node) in ("place", "transition")}
+        known = {node.get("id"): node for node in nodes(self.element) if local(node) in ("place", "transition")}
         for p, name in enumerate(self.net.places):
             self._place(known.get(name), name, p)
         for t, name in enumerate(self.net.transitions):
@@ -80,7 +89,7 @@ class _Writing:
 
     def _drop_missing(self) -> None:
         names = {"place": set(self.net.places), "transition": set(self.net.transitions)}
-        for parent in list(self.element.iter()):
+        for parent in self.parents:
             for node in list(parent):
                 if node.get("id") not in names.get(local(node), {node.get("id")}):
                     parent.remove(node)
@@ -149,7 +158,7 @@ class _Writing:
 
     def _arcs(self) -> None:
         wanted, used = self._wanted(), {node.get("id") for node in self.root.iter()}
-        for parent in list(self.element.iter()):
+        for parent in self.parents:
             for node in [child for child in parent if local(child) == "arc"]:
                 arc = (self._resolved(node.get("source")), self._resolved(node.get("target")), arc_kind(node, "", ""))
                 weight = wanted.pop(arc, None)

@@ -13,9 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.analysis.coverability import Coverability, coverability
+from coordinator.analysis.coverability import Coverability, settle_bounds
 from coordinator.analysis.graph import Graph, Mask
-from coordinator.analysis.siphons import empty_siphon
+from coordinator.analysis.pack import thresholds
+from coordinator.analysis.pumping import find_pump
+from coordinator.analysis.siphons import controlled_siphons, empty_siphon
 from coordinator.analysis.space import Space
 from coordinator.analysis.structure import place_bounds
 from coordinator.analysis.stubborn import Hunt, hunt_deadlock
@@ -50,6 +52,9 @@ class Qualitative:
     space: Space
     graph: Graph
     bounds: tuple[int | None, ...]
+    """Proven; by place. They are reached where the space is complete."""
+    most: int | None
+    """The most tokens that any place ever holds; None if unknown or without end."""
     bounded: Verdict
     safe: Verdict
     deadlock_free: Verdict
@@ -73,35 +78,52 @@ class Qualitative:
 
 
 def examine(
-    space: Space, *, final: Callable[[Marking], bool] | None = None, cover: Coverability | None = None
+    space: Space,
+    *,
+    final: Callable[[Marking], bool] | None = None,
+    cover: Coverability | None = None,
+    in_haste: bool = False,
 ) -> Qualitative:
     """All verdicts on the net behind a space.
 
     `final` tells the designed ends: a dead marking that is not final is a deadlock. `cover` is a coverability result if
-    one is at hand; it is computed when the space is not complete.
+    one is at hand; it is computed when the space is not complete. `in_haste` leaves out what takes long: then only what the
+    markings found say at a glance is told.
     """
     graph = Graph(len(space), space.source, space.target)
-    bounds, bounded, safe = _boundedness(space, cover)
+    if in_haste and cover is None:
+        cover = Coverability(None, (None,) * len(space.net.places), space.reason, 0, False)
+    bounds, bounded, safe, cover = _boundedness(space, cover)
     ends = space.where(final) if final else np.zeros(len(space), dtype=np.bool_)
     dead = space.dead[~ends[space.dead]]
-    hunt = None if space.complete or len(dead) else hunt_deadlock(space.net, final=final, effort=HUNT)
-    levels = _levels(space, graph)
+    settled = space.complete or len(dead) or in_haste
+    hunt = None if settled else hunt_deadlock(space.net, final=final, effort=HUNT)
+    levels = _levels(space, graph, cover)
     return Qualitative(
         space,
         graph,
         bounds,
+        _most(space, bounds),
         bounded,
         safe,
         _deadlock_free(space, dead, final is not None, hunt),
         _grouped(space, dead) + _hunted(space.net, hunt),
         len(dead),
-        _quasi_live(space, levels),
+        _quasi_live(space, levels, cover),
         _live(space, graph, levels, hunt),
         levels,
-        _reversible(space, graph),
+        _reversible(space, graph, hunt),
         _home_states(space, graph),
         _sound(space, graph, ends, levels) if final else None,
     )
+
+
+def _most(space: Space, bounds: tuple[int | None, ...]) -> int | None:
+    """The most tokens in any place: known where a bound is reached by a marking found and no other is above it."""
+    if None in bounds:
+        return None
+    highest = max((b for b in bounds if b is not None), default=0)
+    return highest if space.complete or highest == max(space.bounds, default=0) else None
 
 
 def witness(space: Space, i: int, loop: tuple[str, ...] = ()) -> Witness:
@@ -115,27 +137,37 @@ def _unknown(space: Space, question: str = "") -> Verdict:
     return Verdict(None, f"{text}; {question}" if question else text, complete=False)
 
 
-def _boundedness(space: Space, cover: Coverability | None) -> tuple[tuple[int | None, ...], Verdict, Verdict]:
+def _boundedness(
+    space: Space, cover: Coverability | None
+) -> tuple[tuple[int | None, ...], Verdict, Verdict, Coverability | None]:
+    """(bounds, bounded, safe, the coverability result that was used, if any)."""
     if space.complete:
         bounds: tuple[int | None, ...] = space.bounds
         most = max(space.bounds, default=0)
         bounded = Verdict(True, f"no place ever holds more than {most} token{'s' * (most != 1)}", assumption=SAFETY)
-        return bounds, bounded, _safe(space, True)
+        return bounds, bounded, _safe(space, True), None
     proven = place_bounds(space.net)
     if all(b is not None for b in proven):
         bounded = Verdict(True, f"bounded by invariants and capacities, although {space.reason}", assumption=SAFETY)
-        return tuple(proven), bounded, _safe(space, max(b or 0 for b in proven) <= 1)
-    cover = cover or coverability(space.net, first_omega=True, bounds=proven)
-    known = [b if b is not None else c for b, c in zip(proven, cover.bounds, strict=True)]
-    if cover.bounded is False:
-        shown = Witness(cover.prefix, _marked(space.net, cover.prefix), cover.pump)
-        reason = f"{', '.join(cover.grows)} can grow without end: {' '.join(cover.pump)} can be repeated for ever"
-        settled = tuple(b if cover.complete else p for b, p in zip(known, proven, strict=True))
-        return settled, Verdict(False, reason, shown), Verdict(False, reason, shown)
+        return tuple(proven), bounded, _safe(space, max((b or 0 for b in proven), default=0) <= 1), cover
+    cover = cover or settle_bounds(space.net, proven)
+    pump = (cover.prefix, cover.pump, cover.grows) if cover.bounded is False else find_pump(space)
+    known = tuple(_lower(b, c) for b, c in zip(proven, cover.bounds, strict=True))
+    if pump is not None:
+        prefix, again, grows = pump
+        shown = Witness(prefix, _marked(space.net, prefix), again)
+        reason = f"{', '.join(grows)} can grow without end: {' '.join(again)} can be repeated for ever"
+        settled = known if cover.complete else tuple(proven)
+        return settled, Verdict(False, reason, shown), Verdict(False, reason, shown), cover
     if cover.bounded:
         bounded = Verdict(True, f"bounded by the coverability tree, although {space.reason}", assumption=SAFETY)
-        return tuple(known), bounded, _safe(space, max(b or 0 for b in known) <= 1)
-    return tuple(known), _unknown(space, cover.reason), _safe(space, False)
+        return known, bounded, _safe(space, max((b or 0 for b in known), default=0) <= 1), cover
+    return known, _unknown(space, cover.reason), _safe(space, False), cover
+
+
+def _lower(one: int | None, other: int | None) -> int | None:
+    """The lower of two bounds; None is none."""
+    return other if one is None else one if other is None else min(one, other)
 
 
 def _marked(net: Net, firings: tuple[str, ...]) -> dict[str, int]:
@@ -175,12 +207,31 @@ def _deadlock_free(space: Space, dead: NDArray[np.int64], has_final: bool, hunt:
             f"nothing can happen any more with {', '.join(found.marked) or 'nothing'} marked (found by stubborn sets)"
         )
         return Verdict(False, reason, found.witness, complete=False)
+    always = _never_barred(space.net)
+    if not space.complete and always is not None:
+        return Verdict(True, f"{always} needs nothing and nothing bars it: it can always fire", assumption=FAIRNESS)
+    if hunt is not None and not hunt.complete and not has_final and _siphons_suffice(space.net):
+        reason = "every siphon holds a trap that is marked at first, so some transition is always enabled"
+        return Verdict(True, reason, assumption=FAIRNESS)
     if hunt is not None and hunt.complete:
         reason = f"no reachable marking{other} is dead: {hunt.states} markings along stubborn sets stand for all"
         return Verdict(True, reason, assumption=FAIRNESS)
     if not space.complete:
         return _unknown(space, f"no dead marking{other} among the {space.expanded} looked at")
     return Verdict(True, f"no reachable marking{other} is dead", assumption=FAIRNESS)
+
+
+def _never_barred(net: Net) -> str | None:
+    """A transition that is enabled in every marking (or one above it in priority is)."""
+    free = (t for t in range(len(net.transitions)) if not net.consume[t] and not thresholds(net, t))
+    return next((net.transitions[t] for t in free), None)
+
+
+def _siphons_suffice(net: Net) -> bool:
+    """Whether Commoner's condition rules out a dead marking: weights of one and nothing that bars a firing."""
+    plain = not any(net.inhibit) and len(set(net.priority)) <= 1 and all(c is None for c in net.capacity)
+    single = all(w == 1 for arcs in net.consume for _, w in arcs)
+    return plain and single and bool(net.transitions) and controlled_siphons(net) is True
 
 
 def _grouped(space: Space, dead: NDArray[np.int64]) -> tuple[Deadlock, ...]:
@@ -196,12 +247,13 @@ def _grouped(space: Space, dead: NDArray[np.int64]) -> tuple[Deadlock, ...]:
     return tuple(out)
 
 
-def _levels(space: Space, graph: Graph) -> tuple[int | None, ...]:
+def _levels(space: Space, graph: Graph, cover: Coverability | None) -> tuple[int | None, ...]:
     count = len(space.net.transitions)
+    if not space.complete:
+        never = set(cover.never if cover is not None else ())
+        return tuple(0 if name in never else None for name in space.net.transitions)
     fired = np.bincount(space.label, minlength=count) > 0
     cyclic = np.bincount(space.label[graph.inner], minlength=count) > 0
-    if not space.complete:
-        return tuple(None for _ in range(count))
     everywhere = np.ones(count, dtype=np.bool_)
     ours = graph.components[space.source]
     for component in np.flatnonzero(graph.bottom).tolist():
@@ -212,11 +264,18 @@ def _levels(space: Space, graph: Graph) -> tuple[int | None, ...]:
     )
 
 
-def _quasi_live(space: Space, levels: tuple[int | None, ...]) -> Verdict:
+def _quasi_live(space: Space, levels: tuple[int | None, ...], cover: Coverability | None) -> Verdict:
     fired = np.bincount(space.label, minlength=len(levels)) > 0
     if fired.all():
         return Verdict(True, "every transition can fire", assumption=FAIRNESS, complete=space.complete)
     idle = [space.net.transitions[t] for t in np.flatnonzero(~fired)]
+    dead = [name for name, level in zip(space.net.transitions, levels, strict=True) if level == 0]
+    if not space.complete and dead:
+        return Verdict(False, f"can never fire: {', '.join(dead)} (by the coverability tree)", complete=False)
+    if not space.complete and cover is not None and cover.exact:
+        return Verdict(
+            True, "every transition can fire (by the coverability tree)", assumption=FAIRNESS, complete=False
+        )
     if not space.complete:
         return _unknown(space, f"not seen to fire so far: {', '.join(idle)}")
     return Verdict(False, f"can never fire: {', '.join(idle)}")
@@ -230,6 +289,9 @@ def _live(space: Space, graph: Graph, levels: tuple[int | None, ...], hunt: Hunt
         first = int(space.dead[0])
         reason = f"nothing can fire any more in {space.net.describe(space.marking(first))}"
         return Verdict(False, reason, witness(space, first), complete=space.complete)
+    useless = [name for name, level in zip(names, levels, strict=True) if level == 0]
+    if useless and not space.complete:
+        return Verdict(False, f"can never fire: {', '.join(useless)} (by the coverability tree)", complete=False)
     if not space.complete:
         return _unknown(space)
     lost = [t for t, level in enumerate(levels) if level != 4]
@@ -246,8 +308,11 @@ def _live(space: Space, graph: Graph, levels: tuple[int | None, ...], hunt: Hunt
     raise AssertionError("a transition that is not live is missing in some bottom component")
 
 
-def _reversible(space: Space, graph: Graph) -> Verdict:
+def _reversible(space: Space, graph: Graph, hunt: Hunt | None) -> Verdict:
     if not space.complete:
+        for found in _hunted(space.net, hunt):
+            if found.witness.firings:
+                return Verdict(False, "a dead marking never returns to the start", found.witness, complete=False)
         stuck = space.dead[space.dead > 0]
         if len(stuck):
             first = int(stuck[0])

@@ -2,84 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from coordinator.analysis.coverability import Coverability, settle_bounds
 from coordinator.analysis.forecast import Forecast, forecast
 from coordinator.analysis.gspn import Chain, Gspn
 from coordinator.analysis.markov import LongRun, long_run
 from coordinator.analysis.ordinary import OrdinaryView
+from coordinator.analysis.pumping import find_pump
 from coordinator.analysis.qualitative import Qualitative, examine
 from coordinator.analysis.robot import Recovery, RobotVerdicts, judge, one_run_each
-from coordinator.analysis.siphons import PlaceSets, controlled_siphons, minimal_siphons, minimal_traps
-from coordinator.analysis.space import EngineName, Limits, explore
+from coordinator.analysis.space import INTERRUPTED, EngineName, Limits, Space, explore
 from coordinator.analysis.stochastic import Measured, stochastic_view
-from coordinator.analysis.structure import (
-    Semiflows,
-    conflict_sets,
-    exclusive_places,
-    is_strictly_conservative,
-    lyapunov,
-    place_semiflows,
-    transition_semiflows,
-)
+from coordinator.analysis.structural import Structure
+from coordinator.analysis.structure import place_bounds
 from coordinator.analysis.verdict import Verdict
-from coordinator.net import Net
+from coordinator.net import Marking, Net
 from coordinator.task import Kind, Task
 
 SHOWN = 20
 """Entries of a list that the text shows."""
-
-
-@dataclass(frozen=True)
-class Structure:
-    """What the arcs alone say, computed when asked for."""
-
-    net: Net
-
-    @cached_property
-    def place_flows(self) -> Semiflows:
-        """P-semiflows."""
-        return place_semiflows(self.net)
-
-    @cached_property
-    def transition_flows(self) -> Semiflows:
-        """T-semiflows."""
-        return transition_semiflows(self.net)
-
-    @cached_property
-    def siphons(self) -> PlaceSets:
-        """Minimal siphons."""
-        return minimal_siphons(self.net)
-
-    @cached_property
-    def traps(self) -> PlaceSets:
-        """Minimal traps."""
-        return minimal_traps(self.net)
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain data, places and transitions by name."""
-        places, transitions = self.net.places, self.net.transitions
-        function = lyapunov(self.net)
-        return {
-            "p_invariants": [{places[p]: n for p, n in sorted(y.items())} for y in self.place_flows.vectors],
-            "t_invariants": [{transitions[t]: n for t, n in sorted(x.items())} for x in self.transition_flows.vectors],
-            "invariants_complete": self.place_flows.complete and self.transition_flows.complete,
-            "siphons": [sorted(places[p] for p in s) for s in self.siphons.sets],
-            "traps": [sorted(places[p] for p in s) for s in self.traps.sets],
-            "siphons_complete": self.siphons.complete and self.traps.complete,
-            "siphons_controlled": controlled_siphons(self.net),
-            "structurally_bounded": function is not None,
-            "conservative": function is not None and function.conserved,
-            "strictly_conservative": is_strictly_conservative(self.net),
-            "lyapunov": {places[p]: n for p, n in sorted(function.weights.items())} if function else None,
-            "conflicts": [[transitions[t] for t in group] for group in conflict_sets(self.net)],
-            "exclusive_places": sorted([places[p], places[q]] for p, q in exclusive_places(self.net, self.place_flows)),
-        }
 
 
 @dataclass(frozen=True)
@@ -97,6 +43,8 @@ class Analysis:
     notes: tuple[str, ...]
     one_run_each: Verdict | None = None
     """Of a task: whether no action place is entered while its run goes on."""
+    interrupted: bool = False
+    """Whether Ctrl-C kept something from being found out."""
 
     @property
     def progress(self) -> Qualitative:
@@ -117,11 +65,11 @@ class Analysis:
             "net": _sizes(self.net),
             "states": None if unbounded else len(q.space),
             "edges": None if unbounded else q.space.edges,
-            "complete": q.space.complete,
-            "reason": q.space.reason,
+            "complete": q.space.complete and not self.interrupted,
+            "reason": q.space.reason or (INTERRUPTED if self.interrupted else ""),
             "engine": q.space.engine,
             "bounded": q.bounded.holds,
-            "max_tokens_per_place": _largest(q.bounds),
+            "max_tokens_per_place": q.most,
             "max_tokens_in_marking": q.space.most_tokens if q.space.complete else None,
             "bounds": dict(zip(self.net.places, q.bounds, strict=True)),
             "safe": q.safe.holds,
@@ -161,7 +109,7 @@ class Analysis:
                 "residual": self.forecast.done.residual,
                 "forecast": self.forecast.to_json(),
             }
-        return {}
+        return {"throughput": None, "mean_tokens": None, "residual": None}
 
     def figures(self) -> dict[str, float]:
         """The numbers by which two analyses are compared."""
@@ -246,58 +194,132 @@ def analyse(
     stages: int = 8,
     limits: Limits | None = None,
     engine: EngineName = "auto",
+    ordinary: Net | None = None,
 ) -> Analysis:
     """All verdicts on a net or task; with `view="gspn"` also the numbers of its stochastic view.
 
     A GSPN gives its long run from the initial marking; a task its forecast. Numbers that cannot be had (a partial space, a
-    timeless trap) leave a note instead. `limits` hold for each state space that is explored.
+    timeless trap) leave a note instead. `limits` hold for each state space that is explored. `ordinary` is the ordinary view
+    of a GSPN if it is not the GSPN's own net: where its rates and priorities were not said by the file of the net itself.
     """
     if isinstance(model, Task):
         return _analyse_task(model, view, measured, stages, limits, engine)
-    net = model.net if isinstance(model, Gspn) else model
-    space = explore(net, limits=limits, engine=engine)
+    net = ordinary or (model.net if isinstance(model, Gspn) else model)
     notes: list[str] = []
+    found = _examined(net, limits, engine, notes)
     run = None
-    if isinstance(model, Gspn) and view == "gspn":
-        try:
-            run = long_run(Chain.of(model, space=space))
-        except (ValueError, ArithmeticError) as why:
-            notes.append(f"no long run: {why}")
-    return Analysis(name or "net", net, examine(space), None, None, Structure(net), run, None, tuple(notes))
+    if isinstance(model, Gspn) and view == "gspn" and not notes:
+        run = _long_run(model, found.space, limits, engine, notes)
+    stopped = bool(notes) and notes[-1] == CUT
+    return Analysis(name or "net", net, found, None, None, Structure(net), run, None, tuple(notes), interrupted=stopped)
+
+
+LOOK = 10_000
+"""Markings after which a net is asked whether it can grow without end, before it is searched to its limits."""
+CUT = "Ctrl-C: a partial answer, what had been found by then"
+
+
+def _search(net: Net, limits: Limits | None, engine: EngineName) -> tuple[Space, Coverability | None]:
+    """The space within the limits; a net that proves to be unbounded is searched no further than LOOK."""
+    limits = limits or Limits()
+    if limits.states is None or limits.states > LOOK:
+        first = explore(net, limits=replace(limits, states=LOOK), engine=engine)
+        if first.complete or len(first) < LOOK:
+            return first, None
+        proven = place_bounds(net)
+        cover = settle_bounds(net, proven) if None in proven else None
+        if cover is not None and cover.bounded is False:
+            return replace(first, reason="it has no end: the net is unbounded"), cover
+        if cover is not None and cover.bounded is None and find_pump(first) is not None:
+            return replace(first, reason="it has no end: the net is unbounded"), cover
+    return explore(net, limits=limits, engine=engine), None
+
+
+def _examined(
+    net: Net,
+    limits: Limits | None,
+    engine: EngineName,
+    notes: list[str],
+    final: Callable[[Marking], bool] | None = None,
+) -> Qualitative:
+    """All verdicts; after Ctrl-C those that are plain to see, and a note."""
+    space: Space | None = None
+    try:
+        space, cover = _search(net, limits, engine)
+        if space.reason != INTERRUPTED:
+            return examine(space, final=final, cover=cover)
+    except KeyboardInterrupt:
+        space = space or explore(net, limits=Limits(states=1))
+    notes.append(CUT)
+    return examine(replace(space, complete=False, reason=INTERRUPTED), final=final, in_haste=True)
+
+
+def _long_run(model: Gspn, space: Space, limits: Limits | None, engine: EngineName, notes: list[str]) -> LongRun | None:
+    try:
+        if model.net != space.net:
+            space = explore(model.net, limits=limits, engine=engine)
+        if space.reason != INTERRUPTED:
+            return long_run(Chain.of(model, space=space))
+    except (ValueError, ArithmeticError, MemoryError) as why:
+        notes.append(f"no long run: {str(why) or 'out of memory'}")
+        return None
+    except KeyboardInterrupt:
+        pass
+    notes.append(CUT)
+    return None
 
 
 def _analyse_task(
     task: Task, view: str, measured: Measured | None, stages: int, limits: Limits | None, engine: EngineName
 ) -> Analysis:
     ordinary, notes = OrdinaryView(task), list[str]()
-    space = explore(ordinary.net, limits=limits, engine=engine)
-    qualitative = examine(space, final=ordinary.is_end)
-    closed = robot = None
+    found = _examined(ordinary.net, limits, engine, notes, ordinary.is_end)
+    single = [p.name for p in task.flat.places.values() if p.kind is Kind.ACTION and p.servers is None]
+    alone, whole = one_run_each(found.space, single), Structure(ordinary.net)
+    closed = robot = numbers = None
+    try:
+        if not notes:
+            closed, robot = _closed(ordinary, found.space, limits, engine, notes)
+        if view == "gspn" and CUT not in notes:
+            numbers = _forecast(task, measured, stages, limits, notes)
+    except KeyboardInterrupt:
+        notes.append(CUT)
+    stopped = CUT in notes
+    return Analysis(task.name, ordinary.net, found, closed, robot, whole, None, numbers, tuple(notes), alone, stopped)
+
+
+def _closed(
+    ordinary: OrdinaryView, space: Space, limits: Limits | None, engine: EngineName, notes: list[str]
+) -> tuple[Qualitative | None, RobotVerdicts | None]:
+    """The closed net's verdicts and the robot's; a note where they cannot be had."""
     try:
         net = ordinary.closed(space)
         again = explore(net, limits=limits, engine=engine)
-        closed, robot = examine(again), judge(again, ordinary.roles(net), space)
+        if again.reason == INTERRUPTED:
+            raise KeyboardInterrupt
+        return examine(again), judge(again, ordinary.roles(net), space)
     except ValueError as why:
         notes.append(f"live and proper are judged on the open net: {why}")
-    numbers = None
-    if view == "gspn":
-        try:
-            numbers = forecast(stochastic_view(task, measured, stages=stages), limits=limits)
-        except (ValueError, ArithmeticError) as why:
-            notes.append(f"no forecast: {why}")
-    single = [p.name for p in task.flat.places.values() if p.kind is Kind.ACTION and p.servers is None]
-    alone = one_run_each(space, single)
-    whole = Structure(ordinary.net)
-    return Analysis(task.name, ordinary.net, qualitative, closed, robot, whole, None, numbers, tuple(notes), alone)
+        return None, None
+
+
+def _forecast(
+    task: Task, measured: Measured | None, stages: int, limits: Limits | None, notes: list[str]
+) -> Forecast | None:
+    try:
+        found = forecast(stochastic_view(task, measured, stages=stages), limits=limits)
+    except (ValueError, ArithmeticError, MemoryError) as why:
+        if INTERRUPTED in str(why):
+            raise KeyboardInterrupt from why
+        notes.append(f"no forecast: {str(why) or 'out of memory'}")
+        return None
+    _ = found.worth, found.recovery_time, found.throughput, found.mean_tokens
+    return found
 
 
 def _sizes(net: Net) -> dict[str, int]:
     arcs = sum(map(len, (*net.consume, *net.produce, *net.inhibit)))
     return {"places": len(net.places), "transitions": len(net.transitions), "arcs": arcs}
-
-
-def _largest(bounds: tuple[int | None, ...]) -> int | None:
-    return None if None in bounds else max((b for b in bounds if b is not None), default=0)
 
 
 def _recovery(r: Recovery) -> Mapping[str, Any]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from coordinator.analysis.explore import Engine, Explored, Labels, Numbers
 from coordinator.analysis.explore_integers import IntegerEngine
-from coordinator.analysis.pack import Layout, Tokens, Words
+from coordinator.analysis.pack import Layout, Tokens, TooManyTokens, Words
 from coordinator.analysis.structure import place_bounds, place_semiflows
 from coordinator.net import Marking, Net
 
@@ -162,26 +162,35 @@ def explore(
     """The reachable markings of a net from its initial one.
 
     `bounds` (tokens by place, None: unknown; by default from the P-invariants) only size the fields; they need not be
-    right. With `edges=False` the edges
-    are counted, not kept. Ctrl-C and limits give the partial space found so far, marked incomplete. Raises TooManyTokens
-    if a place outgrows 63 bits and ImportError if numba is asked for and not installed.
+    right. With `edges=False` the edges are counted, not kept. Ctrl-C, limits and a place that outgrows 63 bits give the
+    partial space found so far, marked incomplete. Raises TooManyTokens if the initial marking has such a place and
+    ImportError if numba is asked for and not installed.
     """
     limits = limits or Limits()
     started = limits.clock() if limits.clock else 0.0
     if engine in ("auto", "integers"):
         layout = Layout.for_net(net, bounds, NARROW)
-        first: Engine = IntegerEngine(Explored.start(net, layout, edges))
+        name, found = "integers", _plain_engine(net, layout, edges)
         budget = HANDOVER if engine == "auto" else None
-        name, found = "integers", first
-        reason = _run(first, limits, started, budget)
-        if reason == _HAND_OVER:
-            name, found = "numpy", _engine("numpy", first.explored(), bounds)
-            reason = _run(found, limits, started, None)
     else:
         layout = Layout.for_net(net, bounds, 2)
-        name, found = engine, _engine(engine, Explored.start(net, layout, edges), bounds)
-        reason = _run(found, limits, started, None)
+        name, found, budget = engine, _engine(engine, Explored.start(net, layout, edges), bounds), None
+    try:
+        reason = _run(found, limits, started, budget)
+        if reason == _HAND_OVER:
+            name, found = "numpy", _engine("numpy", found.explored(), bounds)
+            reason = _run(found, limits, started, None)
+    except KeyboardInterrupt:
+        reason = INTERRUPTED
     return _space(found.explored(), reason, name)
+
+
+INTERRUPTED = "interrupted"
+"""Reason of a search that Ctrl-C ended."""
+
+
+def _plain_engine(net: Net, layout: Layout, edges: bool) -> Engine:
+    return IntegerEngine(Explored.start(net, layout, edges))
 
 
 _HAND_OVER = "hand over"
@@ -206,7 +215,7 @@ def _engine(name: str, begun: Explored, bounds: Sequence[int | None] | None) -> 
 
 
 def _run(engine: Engine, limits: Limits, started: float, budget: int | None) -> str:
-    """Expand until done; gives the reason why it stopped early, or an empty text."""
+    """Expand until done; gives the reason why it stopped early, or an empty text. Lets KeyboardInterrupt through."""
     cap = min((n for n in (limits.states, budget) if n is not None), default=None)
     try:
         while engine.expand(cap):
@@ -218,8 +227,8 @@ def _run(engine: Engine, limits: Limits, started: float, budget: int | None) -> 
                 return f"memory limit of {limits.memory} bytes"
             if limits.seconds is not None and limits.clock and limits.clock() - started > limits.seconds:
                 return f"time limit of {limits.seconds:g} s"
-    except KeyboardInterrupt:
-        return "interrupted"
+    except TooManyTokens as grown:
+        return str(grown)
     except MemoryError:
         return "out of memory"
     if engine.expanded == engine.states:
@@ -232,11 +241,14 @@ def _run(engine: Engine, limits: Limits, started: float, budget: int | None) -> 
 def _space(found: Explored, reason: str, engine: str) -> Space:
     row = np.full(len(found.words) + 1, found.row[-1], dtype=np.int64)
     row[: len(found.row)] = found.row
+    states = len(found.words)
+    if reason and found.keep_edges:  # an interruption may have left markings whose edges are not yet in
+        states = int(found.target.max(initial=0)) + 1
     return Space(
         found.net,
         found.layout,
-        found.words,
-        row,
+        found.words[:states],
+        row[: states + 1],
         found.target,
         found.label,
         len(found.row) - 1,

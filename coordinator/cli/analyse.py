@@ -25,9 +25,13 @@ TOLD_EVERY, TOLD_AFTER = 0.5, 2.0
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument("file", help="a net or task file, or the name of a task that comes with petrobot")
-    parser.add_argument("--view", choices=("ordinary", "gspn"), default="ordinary", help="default: %(default)s")
     parser.add_argument(
-        "--rates", metavar="FILE", help="a rates file, or the word unit, for a net without rates of its own"
+        "--view", choices=("ordinary", "gspn"), help="default: gspn for a net with rates, ordinary for all else"
+    )
+    parser.add_argument(
+        "--rates",
+        metavar="FILE",
+        help="rates of transitions (TOML: `[rates]` and `ID = PER_SECOND` below it), or the word unit for 1/s each",
     )
     parser.add_argument(
         "--states", type=int, default=5_000_000, metavar="N", help="most markings (default: %(default)s)"

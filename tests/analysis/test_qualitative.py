@@ -216,7 +216,7 @@ def test_a_deadlock_far_outside_a_partial_search_is_hunted_down() -> None:
     net = philosophers(60)
     result = examine(explore(net, limits=Limits(states=2000)))
     assert result.deadlock_free.holds is False and result.live.holds is False and not result.live.complete
-    assert result.bounded.holds is True and result.safe.holds is True and result.reversible.holds is None
+    assert result.bounded.holds is True and result.safe.holds is True and result.reversible.holds is False
     (found,) = result.deadlocks
     *_, last = net.replay(found.witness.firings)
     assert not net.enabled(last) and "fork0" in found.emptied

@@ -14,9 +14,7 @@ from coordinator.analysis.commands import (
     analyse_command,
     convert_command,
     graph_command,
-    read_rates,
     simulate_command,
-    unit_rates,
 )
 from coordinator.analysis.forecast import forecast
 from coordinator.analysis.formats import read_net
@@ -24,6 +22,7 @@ from coordinator.analysis.gspn import Gspn
 from coordinator.analysis.netfile import FormatError, NetFile
 from coordinator.analysis.picture import graph_svg
 from coordinator.analysis.pnml_writing import write_pnml
+from coordinator.analysis.rates import read_rates, unit_rates
 from coordinator.analysis.report import analyse, heat
 from coordinator.analysis.space import Limits, explore
 from coordinator.analysis.stochastic import stochastic_view
@@ -44,7 +43,8 @@ def test_a_net_file_gives_the_promised_keys(tmp_path: Path) -> None:
     path = tmp_path / "kanban.pnml"
     path.write_text(write_pnml(NetFile(kanban(1))), encoding="utf-8")
     plain = analyse_command(path, load)
-    assert plain.code == 0 and set(plain.data) >= PROMISED and not set(plain.data) & NUMBERS
+    assert plain.code == 0 and set(plain.data) >= PROMISED | NUMBERS
+    assert all(plain.data[key] is None for key in NUMBERS)
     data = json.loads(json.dumps(plain.data))
     assert data["net"] == {"places": 16, "transitions": 16, "arcs": 40}
     assert (data["states"], data["edges"], data["home_states"]) == (160, 616, 160)
@@ -58,7 +58,7 @@ def test_a_net_file_gives_the_promised_keys(tmp_path: Path) -> None:
     assert data["max_tokens_per_place"] == 1 and data["deadlocks"] == [] and data["structure"]["conservative"]
     rates = tmp_path / "rates.toml"
     rates.write_text("[rates]\n" + "".join(f"{k} = {v}\n" for k, v in KANBAN_RATES.items()), encoding="utf-8")
-    timed = analyse_command(path, load, view="gspn", rates=rates)
+    timed = analyse_command(path, load, rates=rates)
     assert set(timed.data) >= PROMISED | NUMBERS
     assert timed.data["throughput"]["tin1"] == pytest.approx(0.0925846346333826, abs=1e-12)
     assert analyse_command(path, load, view="gspn", rates="unit").data["throughput"]["tin1"] > 0
@@ -190,6 +190,12 @@ def test_the_graph_is_a_picture_with_the_witness_in_it(tmp_path: Path) -> None:
     ("text", "said"),
     [
         ("[rates]\nnobody = 1.0", "no transition"),
+        ("[rates]\narrive = 1\n[weights]\narrive = 1", "a rate and a weight"),
+        ("[servers]\nserve = true", "True servers"),
+        ("servers = 2", "no table"),
+        ("default_rate = 'fast'", "no table of numbers"),
+        ('{"rates": {"arrive": 1', "TOML"),
+        ("[rates]\narrive = nan", "positive"),
         ("[rates]\narrive = 'fast'", "no table of numbers"),
         ("rates = 3", "no table of numbers"),
         ("[rate]\narrive = 1", "unknown key"),
@@ -200,6 +206,15 @@ def test_the_graph_is_a_picture_with_the_witness_in_it(tmp_path: Path) -> None:
 def test_bad_rates_files_say_what_is_wrong(text: str, said: str) -> None:
     with pytest.raises(FormatError, match=said):
         read_rates(text, "rates.toml", NetFile(queue(2)))
+
+
+def test_rates_may_stand_at_the_top_and_be_few() -> None:
+    """As a flat table or JSON; transitions that are not named get 1/s, or keep what their net file says."""
+    assert read_rates("serve = 2", "r", NetFile(queue(2))).rate == (1.0, 2.0)
+    assert read_rates('{"serve": 2.5}', "r", NetFile(queue(2))).rate == (1.0, 2.5)
+    known = Gspn.of(queue(2), {"serve": 4.0}, servers={"serve": None})
+    changed = read_rates("[weights]\narrive = 3", "r", NetFile(known.net, gspn=known))
+    assert changed.rate == (None, 4.0) and changed.weight[0] == 3.0 and changed.servers[1] is None
 
 
 def test_rates_files() -> None:
