@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import secrets
+from datetime import UTC, datetime
 from typing import Any
 
 from coordinator.realtime import credentials_of
@@ -16,7 +17,10 @@ from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
 
 
 async def ask_all(directory: Directory, timeout: float) -> dict[str, Any]:
-    """What each node answers within `timeout` s: address, whether it is up, what it offers, its status; else why not."""
+    """What each node answers within `timeout` s: address, whether it is up, what it offers, its status; else why not.
+
+    With mutual TLS also when the certificate ends that the node shows.
+    """
     asked = await asyncio.gather(*(_ask(directory, node, timeout) for node in directory.nodes))
     return dict(zip(directory.nodes, asked, strict=True))
 
@@ -42,6 +46,8 @@ async def _ask(directory: Directory, node: str, timeout: float) -> dict[str, Any
         caller.command(client.now(), Command(f"{name}/status", "status"))
         client.flush()
         status = await asyncio.wait_for(told, timeout)
+        if (ends := client.certificate_ends) is not None:
+            answer["certificate_ends"] = datetime.fromtimestamp(ends, UTC).isoformat()
         answer |= {"offers": list(caller.offers), "boot": caller.boot, "version": NEWEST_VERSION, "status": status}
     else:
         answer["why"] = refused[-1] if refused else client.trouble

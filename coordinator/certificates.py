@@ -2,7 +2,7 @@
 
 X.509 v3 (RFC 5280) with keys on the curve P-256. A node's certificate bears its name in services.toml, as common name and as
 DNS name: that is what the other end checks, so an address may change without a new certificate. What exists is kept, so the
-command can be run again when a node is added.
+command can be run again when a node is added; a certificate that ends within 30 days is made anew.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from services.comm.credentials import CA_FILE
+from services.comm.credentials import CA_FILE, RENEW_CA
+from services.comm.expiry import SOON
 
 CA_KEY = "ca.key"
 CA_NAME = "petrobot cell authority"
@@ -31,20 +32,22 @@ class CertificateError(Exception):
     """The certificates cannot be made; the text says why and what to do."""
 
 
-def make_certificates(folder: Path, parties: Sequence[str]) -> list[str]:
+def make_certificates(folder: Path, parties: Sequence[str], now: datetime | None = None) -> list[str]:
     """Make what is missing of the authority and of each party's certificate and key; gives the files written.
 
-    Keys are readable by their owner alone. Raises CertificateError.
+    A party's certificate that ends soon is made anew, with its key. Keys are readable by their owner alone. `now` is the time
+    that the certificates count from (default: this moment). Raises CertificateError, also when the authority itself ends soon.
     """
+    now = now or datetime.now(UTC)
     if clash := {"ca"} & set(parties):
         raise CertificateError(f"a node is named {clash.pop()!r}, as the authority's files are; rename the node")
     written: list[str] = []
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        authority, key = _authority(folder, written)
+        authority, key = _authority(folder, now, written)
         for party in parties:
-            if not (folder / f"{party}.pem").exists():
-                _issue(folder, party, authority, key, written)
+            if not _lasts(folder / f"{party}.pem", now):
+                _issue(folder, party, authority, key, now, written)
     except OSError as fault:
         raise CertificateError(f"{fault.filename or folder}: {fault.strerror}; name another folder") from fault
     except ValueError as fault:
@@ -54,7 +57,12 @@ def make_certificates(folder: Path, parties: Sequence[str]) -> list[str]:
     return written
 
 
-def _authority(folder: Path, written: list[str]) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
+def _lasts(file: Path, now: datetime) -> bool:
+    """Whether this certificate is there and good for some time."""
+    return file.exists() and x509.load_pem_x509_certificate(file.read_bytes()).not_valid_after_utc - now > SOON
+
+
+def _authority(folder: Path, now: datetime, written: list[str]) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
     """The folder's authority, made if there is none."""
     certificate, key = folder / CA_FILE, folder / CA_KEY
     if certificate.exists():
@@ -63,11 +71,13 @@ def _authority(folder: Path, written: list[str]) -> tuple[x509.Certificate, ec.E
         loaded = serialization.load_pem_private_key(key.read_bytes(), None)
         if not isinstance(loaded, ec.EllipticCurvePrivateKey):
             raise ValueError("another kind of key")
+        if not _lasts(certificate, now):
+            raise CertificateError(f"{certificate}: the authority ends soon, or has ended; {RENEW_CA}")
         return x509.load_pem_x509_certificate(certificate.read_bytes()), loaded
     private = ec.generate_private_key(ec.SECP256R1())
     name = _name(CA_NAME)
     made = (
-        _builder(name, name, private.public_key(), CA_LIFE)
+        _builder(name, name, private.public_key(), now, now + CA_LIFE)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(_usage(signs_certificates=True), critical=True)
         .sign(private, hashes.SHA256())
@@ -78,11 +88,17 @@ def _authority(folder: Path, written: list[str]) -> tuple[x509.Certificate, ec.E
 
 
 def _issue(
-    folder: Path, party: str, authority: x509.Certificate, key: ec.EllipticCurvePrivateKey, written: list[str]
+    folder: Path,
+    party: str,
+    authority: x509.Certificate,
+    key: ec.EllipticCurvePrivateKey,
+    now: datetime,
+    written: list[str],
 ) -> None:
     private = ec.generate_private_key(ec.SECP256R1())
+    ends = min(now + LIFE, authority.not_valid_after_utc)  # nothing that it signed is good for longer
     made = (
-        _builder(_name(party), authority.subject, private.public_key(), LIFE)
+        _builder(_name(party), authority.subject, private.public_key(), now, ends)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(_usage(signs_certificates=False), critical=True)
         .add_extension(
@@ -97,9 +113,8 @@ def _issue(
 
 
 def _builder(
-    subject: x509.Name, issuer: x509.Name, public: ec.EllipticCurvePublicKey, life: timedelta
+    subject: x509.Name, issuer: x509.Name, public: ec.EllipticCurvePublicKey, now: datetime, ends: datetime
 ) -> x509.CertificateBuilder:
-    now = datetime.now(UTC)
     return (
         x509.CertificateBuilder()
         .subject_name(subject)
@@ -107,7 +122,7 @@ def _builder(
         .public_key(public)
         .serial_number(x509.random_serial_number())
         .not_valid_before(now - CLOCKS)
-        .not_valid_after(now + life)
+        .not_valid_after(ends)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(public), critical=False)
     )
 
@@ -137,7 +152,9 @@ def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def _write(folder: Path, name: str, data: bytes, mode: int, written: list[str]) -> None:
-    """Write a file that is not there yet."""
-    with os.fdopen(os.open(folder / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+    """Write a file, whole or not at all; a key before its certificate, so that one that was broken off is made again."""
+    unfinished = folder / f".{name}.{os.getpid()}"
+    with os.fdopen(os.open(unfinished, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode), "wb") as file:
         file.write(data)
+    unfinished.replace(folder / name)
     written.append(name)

@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write the key or the certificates; what exists is never overwritten."""
+    """Write the key or the certificates; what exists is never overwritten, but for certificates that end within 30 days."""
     directory = load_directory(options.services)
     print(_certificates(directory, options.tls) if options.tls is not None else _shared_key(directory, options.file))
     return 0
@@ -82,7 +82,8 @@ def _certificates(directory: Directory, folder: Path) -> str:
             *copies,
             f"   the coordinator's host, and wherever `petrobot estop` is to work: {CA_FILE}, {COORDINATOR}.pem, "
             f"{COORDINATOR}.key",
-            f"2. keep {CA_KEY} here alone: who has it can make certificates; it is needed only when a node is added",
+            f"2. keep {CA_KEY} here alone: who has it can make certificates; it is needed when a node is added, and when",
+            "   certificates end: run this again in their last 30 days (petrobot nodes and each node's start say so)",
             f"3. name the folder in {directory.source}, the same on every host:",
             f'   [keys]\n   certificates = "{folder.name}"',
         ]

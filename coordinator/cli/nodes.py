@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
+from datetime import UTC, datetime
 from typing import Any
 
 from coordinator.cli.loading import add_services_argument, load_directory, write_json
+from services.comm.expiry import SOON
 
 EXAMPLE = "petrobot nodes --json -"
 
@@ -38,11 +40,23 @@ def _print(answers: dict[str, Any]) -> None:
     from rich.table import Table
 
     table = Table()
-    for column in ("node", "address", "", "offers", "devices"):
+    certified = any("certificate_ends" in answer for answer in answers.values())
+    for column in ("node", "address", "", *(["certificate ends"] if certified else []), "offers", "devices"):
         table.add_column(column)
     for node, answer in answers.items():
         state = "[green]up[/]" if answer["up"] else "[red]away[/]"
         devices = answer.get("status", {}).get("devices", {})
         shown = ", ".join(devices) if isinstance(devices, dict) else json.dumps(devices)
-        table.add_row(node, answer["address"], state, ", ".join(answer.get("offers", [answer.get("why", "")])), shown)
+        ends = [_ends(answer.get("certificate_ends", ""))] if certified else []
+        offers = ", ".join(answer.get("offers", [answer.get("why", "")]))
+        table.add_row(node, answer["address"], state, *ends, offers, shown)
     Console().print(table)
+
+
+def _ends(ends: str) -> str:
+    """The day on which a certificate ends, red when that is soon."""
+    if not ends:
+        return ""
+    left = datetime.fromisoformat(ends) - datetime.now(UTC)
+    day = ends.partition("T")[0]
+    return f"[red]{day}: in {max(left.days, 0)} days; petrobot keys --tls[/]" if left <= SOON else day

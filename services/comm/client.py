@@ -23,7 +23,9 @@ from services.comm.under_way import NEVER
 from services.comm.wire import ProtocolError, Side, State
 
 OnNotices = Callable[[float, list[Notice]], None]
-NOT_TRUSTED = "perhaps our certificate is not trusted there: it takes TLS 1.3 and certificates of its own cell alone"
+NOT_TRUSTED = "perhaps our certificate is not trusted there, or has ended: it takes TLS 1.3 and certificates of its own cell alone"
+_EXPIRED = 10
+"""X509_V_ERR_CERT_HAS_EXPIRED (openssl-verification-options)."""
 _NUMBERS = itertools.count(1)
 """Of calls: of all clients of this process, which may have one name and boot among them."""
 _OUTCOMES = frozenset((Outcome,))
@@ -127,6 +129,12 @@ class Client:
             async with asyncio.timeout(timeout):
                 await self._up.wait()
         return self._up.is_set()
+
+    @property
+    def certificate_ends(self) -> float | None:
+        """When the certificate ends that the peer showed (s since 1970); None while not connected, and without TLS."""
+        certificate = None if self._link is None else self._link.certificate()
+        return None if certificate is None else float(ssl.cert_time_to_seconds(certificate["notAfter"]))
 
     async def close(self, text: str = "the caller stops") -> None:
         """Say good-bye; calls under way end as lost."""
@@ -280,6 +288,10 @@ class Client:
     def _said(self, fault: Exception) -> str:
         """Why there is no connection, in words."""
         if isinstance(fault, ssl.SSLCertVerificationError):
+            if fault.verify_code == _EXPIRED:
+                peer = self.caller.peer
+                text = f"the certificate of {peer}, or its authority's, has ended"
+                return f"{text}; make it anew with `petrobot keys --tls` and copy it to {peer}"
             return f"its certificate is not that of {self.caller.peer}: {fault.verify_message}"
         said = str(getattr(fault, "strerror", "") or fault) or "no answer"
         return f"{said}; {NOT_TRUSTED}" if self.tls is not None and isinstance(fault, ConnectionError) else said

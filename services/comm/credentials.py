@@ -13,16 +13,23 @@ import hmac
 import ssl
 import stat
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
 from services.comm.directory import Directory
+from services.comm.expiry import watch
 from services.comm.security import KeyFileError, read_key
 
 COORDINATOR: Final = "coordinator"
 """The party whose certificate the coordinator and the operator's tools show."""
 CA_FILE: Final = "ca.pem"
 MADE_BY: Final = "`petrobot keys --tls`"
+RENEW: Final = "run {command} where the authority's key is, and copy {name}.pem and {name}.key here"
+RENEW_CA: Final = (
+    "make a new authority with `petrobot keys --tls` and the name of another folder, copy it to every host and name it under "
+    "[keys] in services.toml"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +64,15 @@ class Credentials:
         secret = ticket.partition(".")[0].encode()
         return hmac.digest(secret, b"petrobot set-point stream", hashlib.sha256) if secret else None
 
+    def tell_ends(self, now: datetime | None = None) -> None:
+        """Say on standard error, once in this process each, which of the certificates shown here end soon or have ended."""
+        if self.folder is None:
+            return
+        now = now or datetime.now(UTC)
+        command = f"`petrobot keys --tls {self.folder.name}`"
+        watch(self.folder / f"{self.party}.pem", now, RENEW.format(command=command, name=self.party))
+        watch(self.folder / CA_FILE, now, RENEW_CA)
+
     def _context(self, side: ssl._SSLMethod) -> ssl.SSLContext | None:
         if self.folder is None:
             return None
@@ -72,6 +88,7 @@ class Credentials:
             reason = getattr(fault, "strerror", "") or getattr(fault, "reason", "") or type(fault).__name__
             text = f"{self.folder}: no certificate of {self.party} can be used ({reason})"
             raise KeyFileError(f"{text}; make them with {MADE_BY} and copy {self.party}'s files here") from None
+        self.tell_ends()
         return context
 
 

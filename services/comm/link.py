@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
+from typing import Any
 
 from services.comm.messages import Bye, Event, Feedback, Message, Ping, Pong, Refuse
 from services.comm.security import NONCE_BYTES
@@ -290,6 +291,10 @@ class Link(asyncio.BufferedProtocol):
         self.reason = self.reason or reason
         if self._transport is not None:
             self._transport.abort()
+
+    def certificate(self) -> dict[str, Any] | None:
+        """The other end's certificate, as `ssl.SSLSocket.getpeercert` gives it; None without TLS."""
+        return None if self._transport is None else self._transport.get_extra_info("peercert")
 
     def ends(self) -> tuple[str, str]:
         """Addresses of the other and of this end; empty where there are none."""

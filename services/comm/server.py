@@ -14,10 +14,12 @@ from __future__ import annotations
 import asyncio
 import ssl
 from collections.abc import Callable
+from datetime import UTC, datetime
 
 from services.comm.admission import Bucket, Knocks
 from services.comm.callee import Callee, Order
 from services.comm.credentials import may_speak_as, name_on
+from services.comm.expiry import DAY, look_again
 from services.comm.link import READ_BUFFER, Limits, Link, Timing
 from services.comm.messages import Answer, Bye, Call, Hello, Message, Outcome, Refuse
 from services.comm.security import is_loopback, require_key
@@ -117,7 +119,7 @@ class _ServerLink(Link):
         """The name on the caller's certificate; None without TLS."""
         if self._server.tls is None or self._transport is None:
             return None
-        return name_on(self._transport.get_extra_info("peercert"))
+        return name_on(self.certificate())
 
     def _greet(self, now: float, hello: Hello) -> None:
         certified = self.certified()
@@ -187,6 +189,7 @@ class Server:
         self._server: asyncio.Server | TlsListener | None = None
         self._knocks = Knocks(self.limits.handshakes, self.limits.handshakes_at_once)
         self._timer: asyncio.TimerHandle | None = None
+        self._daily: asyncio.TimerHandle | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
 
     def now(self) -> float:
@@ -207,6 +210,7 @@ class Server:
         else:
             listener = TlsListener(host, port, self.tls, self.timing.handshake, self.limits.opening)
             self._server = listener
+            self._look_at_certificates()
             listener.start(Admission(lambda: _ServerLink(self), self.admits, self.failed))
 
     @property
@@ -230,9 +234,10 @@ class Server:
                 link.end(text, Bye(text))
             else:
                 link.cut(text)
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
+        for timer in (self._timer, self._daily):
+            if timer is not None:
+                timer.cancel()
+        self._timer = self._daily = None
         if self._server is not None:
             await self._server.wait_closed()
         while self._all:
@@ -281,6 +286,12 @@ class Server:
         now = self.now()
         self.callee.advance(now)
         self.flush(now)
+
+    def _look_at_certificates(self) -> None:
+        """A node may run for years: look each day whether its certificates end."""
+        assert self._loop is not None
+        look_again(datetime.now(UTC))
+        self._daily = self._loop.call_later(DAY, self._look_at_certificates)
 
     # What links report.
 

@@ -13,6 +13,7 @@ import socket
 import ssl
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 ACCEPTED: Final = 32
@@ -109,26 +110,25 @@ class TlsListener:
             self._break_off(next(iter(self._shaking)))
         task = self._loop.create_task(self._shake(sock, address, admission))
         self._shaking[task] = None
-        task.add_done_callback(self._forget)
+        task.add_done_callback(partial(self._forget, sock, address, admission))
 
     def _break_off(self, task: asyncio.Task[None]) -> None:
         self._shaking.pop(task, None)
         self._ending.add(task)
         task.cancel()
 
-    def _forget(self, task: asyncio.Task[None]) -> None:
+    def _forget(self, sock: socket.socket, address: str, admission: Admission, task: asyncio.Task[None]) -> None:
         self._shaking.pop(task, None)
         self._ending.discard(task)
+        if task.cancelled():  # broken off, perhaps before it began
+            admission.failed(address)
+            with contextlib.suppress(OSError):
+                sock.close()
 
     async def _shake(self, sock: socket.socket, address: str, admission: Admission) -> None:
         try:
             await self._loop.connect_accepted_socket(
                 admission.protocol, sock, ssl=self._tls, ssl_handshake_timeout=self._handshake
             )
-        except asyncio.CancelledError:
-            admission.failed(address)
-            with contextlib.suppress(OSError):
-                sock.close()
-            raise
         except (OSError, TimeoutError):
             admission.failed(address)
