@@ -8,10 +8,11 @@ so no user code delays it; actions see a `Remote` of it: `send` a command, read 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, Protocol, runtime_checkable
 
 from services.comm.canbus import CanBus
+from services.comm.directory_file import nearest
 from services.comm.image import ImageSource
 
 
@@ -57,6 +58,18 @@ class Ports(Protocol):
 
     def file(self, path: str) -> bytes:
         """A file named in services.toml, relative to it."""
+
+
+PORT_KEYS = ("interface", "channel", "bitrate", "can", "source", "address", "latency")
+"""Keys of a device's table that its ports read: what bus and which images it has."""
+
+
+def refuse_unknown_keys(config: Mapping[str, Any], own: Collection[str]) -> None:
+    """Raise ValueError if a device's table has a key that is neither its driver's `own` nor its ports': a mistyped one would
+    silently be no setting at all. For a driver's constructor."""
+    for key in config:
+        if key not in own and key not in PORT_KEYS:
+            raise ValueError(f"unknown key {key!r}{nearest(key, [*own, *PORT_KEYS])}")
 
 
 class Driver(Protocol):

@@ -52,8 +52,18 @@ class ProcessPorts:
         if self._images is None:
             from services.comm.camera import open_images
 
-            self._images = open_images(self._device.config, self._clock)
+            self._images = open_images(self._located(self._device.config), self._clock)
         return self._images
+
+    def _located(self, config: Mapping[str, Any]) -> Mapping[str, Any]:
+        """With the path of a recording taken relative to services.toml. Raises ValueError if it is not there."""
+        kind, _, path = str(config.get("source", "")).partition(":")
+        if kind != "file" or not path:
+            return config
+        recording = self._directory.file(path)
+        if not recording.is_file():
+            raise ValueError(f'source = "file:{path}": no file {recording}; write the path of a recording')
+        return {**config, "source": f"file:{recording}"}
 
     def stream(self, name: str) -> SetpointReceiver:
         """The receiving end of a stream that services.toml leads to this device. Raises ValueError for any other."""

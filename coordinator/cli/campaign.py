@@ -15,6 +15,7 @@ from coordinator.cli.loading import (
     cell_path,
     load_directory,
     load_task,
+    refuse_misplaced,
     task_path,
     write_json,
 )
@@ -93,7 +94,7 @@ def run(options: argparse.Namespace) -> int:
         else:
             task = load_task(options.task)
             options.services = cell_path(options.services, options.task, task)
-            _refuse_unfit(task, options.services)
+            _refuse_unfit(task, options)
             plan = _plan(options, task)
             folder = options.out or Path("campaigns") / f"{task.name}-{plan.selector}-{plan.seed}-{identity(plan)[:6]}"
         campaign = Campaign(folder, plan, shown)
@@ -134,15 +135,17 @@ def _print_check(check: dict[str, Any] | None) -> None:
         print(agreement_text(check))
 
 
-def _refuse_unfit(task: Task, services: Path | None) -> None:
+def _refuse_unfit(task: Task, options: argparse.Namespace) -> None:
     from coordinator.check import check
 
-    directory = load_directory(services)
+    directory = load_directory(options.services)
     report = check(task, {action: entry.node for action, entry in directory.actions.items()})
     faults = [f for f in report.findings if f.severity == "error"]
     if faults:
         lines = "\n".join(f"  {f.key}: {f.text}\n    {f.remedy}" for f in faults)
         raise CommandError(2, f"{task.name} may not run with {directory.source}:\n{lines}")
+    if not options.cluster:
+        refuse_misplaced(directory, everywhere=True, scripted=options.mock is not None)
 
 
 async def _conduct(campaign: Campaign, options: argparse.Namespace) -> None:

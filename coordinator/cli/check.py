@@ -7,7 +7,14 @@ import asyncio
 import time
 from typing import TYPE_CHECKING
 
-from coordinator.cli.loading import add_services_argument, cell_path, load_directory, load_task, write_json
+from coordinator.cli.loading import (
+    add_services_argument,
+    cell_path,
+    load_directory,
+    load_task,
+    refuse_misplaced,
+    write_json,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -42,6 +49,7 @@ def run(options: argparse.Namespace) -> int:
     services = cell_path(options.services, options.task, task)
     if options.services is not None or services.exists():
         directory = load_directory(services)
+        refuse_misplaced(directory)
         offers = {action: directory.where(action) for action in directory.actions}
     report = check(task, offers)
     missing = _missing(task, services) if options.live else []

@@ -87,6 +87,18 @@ def load_directory(given: Path | None) -> Directory:
         raise CommandError(2, str(fault)) from fault
 
 
+def refuse_misplaced(directory: Directory, *, everywhere: bool = False, scripted: bool = False) -> None:
+    """Refuse a location file that names code, keys or files which this host has not: for commands that launch nodes or judge it.
+
+    `everywhere`: all nodes are launched here, wherever they belong; `scripted`: actions are replaced (`--mock`).
+    """
+    from services.comm.directory_places import misplaced
+
+    faults = misplaced(directory, everywhere=everywhere, actions=not scripted)
+    if faults:
+        raise CommandError(2, "\n".join(faults))
+
+
 def pictures_of(task: Task, result: Mapping[str, Any]) -> dict[str, str]:
     """What the task's own function draws of a mission run's result, SVG by title. Raises CommandError when it cannot be had."""
     if not task.pictures:

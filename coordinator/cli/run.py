@@ -22,6 +22,7 @@ from coordinator.cli.loading import (
     load_directory,
     load_task,
     pictures_of,
+    refuse_misplaced,
     write_json,
 )
 from coordinator.cli.parameters import parameter_of
@@ -111,6 +112,8 @@ def run(options: argparse.Namespace) -> int:
     if options.join and (options.mode != "lockstep" or options.processes != 0):
         raise CommandError(2, "--join is for --mode lockstep --processes 0: nodes in real time are joined always")
     _refuse_unfit(task, directory)
+    if (options.mode == "lockstep" or options.up) and not options.join:
+        refuse_misplaced(directory, everywhere=options.mode == "lockstep", scripted=options.mock is not None)
     setting = _setting(task, directory, options)
     begun = time.perf_counter()
     try:

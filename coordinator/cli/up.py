@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coordinator.cli import CommandError
-from coordinator.cli.loading import add_services_argument, load_directory
+from coordinator.cli.loading import add_services_argument, load_directory, refuse_misplaced
 
 if TYPE_CHECKING:
     from services.comm.directory import Directory
@@ -40,7 +40,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Launch and watch."""
-    return asyncio.run(_up(load_directory(options.services), options))
+    directory = load_directory(options.services)
+    refuse_misplaced(directory, scripted=options.mock is not None)
+    return asyncio.run(_up(directory, options))
 
 
 async def _up(directory: Directory, options: argparse.Namespace) -> int:

@@ -13,8 +13,9 @@ from services.comm import directory_file
 from services.comm.party import TICK
 
 COORDINATOR = directory_file.COORDINATOR
-COORDINATOR_PORT = 7299
-"""Where the coordinator listens unless `[coordinator]` says otherwise."""
+COORDINATOR_PORT = directory_file.COORDINATOR_PORT
+SHIPPED = Path(__file__).parents[2]
+"""Where petrobot's own files are, so that a copied services.toml still finds the shipped numbers."""
 MEMORY = "memory"
 MEMORY_CALLS = ("memory.get", "memory.put", "memory.compare_and_set", "memory.list")
 """What the node that has the global memory offers."""
@@ -178,8 +179,10 @@ class Directory:
         return key in self.services and self.services[key].local
 
     def file(self, path: str) -> Path:
-        """A path written in services.toml, taken relative to it."""
-        return self.source.parent / path
+        """A path written in services.toml, taken relative to it; what is not there but comes with petrobot is taken from there."""
+        beside = self.source.parent / path
+        shipped = SHIPPED / path
+        return shipped if not beside.exists() and shipped.exists() else beside
 
     def delays(self) -> dict[str, int]:
         """Lock-step delays of the links in whole ticks, rounded up, as `services.comm.cell.Delays` takes them."""
@@ -189,7 +192,12 @@ class Directory:
 def load(path: str | Path) -> Directory:
     """Read services.toml. Raises DirectoryError with every fault in it, OSError when it cannot be read."""
     source = Path(path)
-    return parse(source.read_text(encoding="utf-8"), source)
+    try:
+        text = source.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as fault:
+        line = source.read_bytes()[: fault.start].count(b"\n") + 1
+        raise DirectoryError((f"{source}:{line}: not UTF-8 text ({fault.reason}); save the file as UTF-8",)) from fault
+    return parse(text, source)
 
 
 def parse(text: str, source: Path) -> Directory:

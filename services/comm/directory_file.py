@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import hashlib
+import ipaddress
 import json
 import re
 import tomllib
@@ -43,6 +44,23 @@ def _one_of(*choices: str) -> Key:
     return Key("one of " + ", ".join(f'"{c}"' for c in choices), lambda v: v in choices)
 
 
+def _host(value: Any) -> bool:
+    """A name, an IPv4 or an IPv6 address: what looks like an address is one."""
+    if not isinstance(value, str) or not _HOST_NAME.fullmatch(value):
+        return isinstance(value, str) and _is_address(value)
+    return not value.rpartition(".")[2].isdigit() or _is_address(value)
+
+
+def _is_address(text: str) -> bool:
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        return False
+    return True
+
+
+_HOST_NAME = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?(\.[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?)*\.?")
+"""Letters, digits and hyphens in labels (RFC 1123); underscores, which many local networks have, too."""
 _IMPORT_PATH = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 _NAME = re.compile(r"[A-Za-z_][\w-]*")
 
@@ -63,7 +81,7 @@ _PERIOD = _POSITIVE._replace(required=True)
 
 SHAPES: Mapping[str, Mapping[str, Key]] = {
     "nodes": {
-        "host": Key('a host name or address such as "127.0.0.1"', _text, True),
+        "host": Key('a host name or address such as "127.0.0.1", without a port', _host, True),
         "port": Key(
             "a port from 1 to 65535", lambda v: isinstance(v, int) and not isinstance(v, bool) and 0 < v < 65536, True
         ),
@@ -103,6 +121,8 @@ FLAT: Mapping[str, Key] = {
 CHANNELS = ("call", "can", "image", "stream", "control")
 KEYS = ("file", "certificates")
 COORDINATOR = "coordinator"
+COORDINATOR_PORT = 7299
+"""Where the coordinator listens unless `[coordinator]` says otherwise."""
 TOP = ("schema", COORDINATOR, *SHAPES, *FLAT)
 
 
@@ -240,7 +260,7 @@ def _check_key(here: str, key: str, value: Any, shape: Mapping[str, Key], open_:
 
 def _check_places(tables: Tables, faults: Faults, memory: str) -> None:
     nodes, devices = tables["nodes"], tables["devices"]
-    _check_addresses(nodes, faults)
+    _check_addresses(nodes, tables[COORDINATOR], faults)
     for table in ("devices", "services", "timers"):
         for name, entry in tables[table].items():
             _check_node(f"{table}.{name}.node", entry["node"], nodes, faults)
@@ -264,7 +284,7 @@ def _check_node(key: str, node: str, nodes: Mapping[str, Any], faults: Faults) -
         faults.add(key, f"no node is named {node!r}{nearest(node, nodes)}")
 
 
-def _check_addresses(nodes: Mapping[str, Any], faults: Faults) -> None:
+def _check_addresses(nodes: Mapping[str, Any], coordinator: Mapping[str, Any], faults: Faults) -> None:
     taken: dict[tuple[str, int], str] = {}
     for name, entry in nodes.items():
         if name == COORDINATOR:
@@ -274,6 +294,9 @@ def _check_addresses(nodes: Mapping[str, Any], faults: Faults) -> None:
             where = f"{address[0]}:{address[1]}"
             faults.add(f"nodes.{name}.port", f"{where} is already node {taken[address]!r}'s; give each its own port")
         taken.setdefault(address, name)
+    own = (coordinator.get("host", "127.0.0.1"), coordinator.get("port", COORDINATOR_PORT))
+    if own in taken:
+        faults.add(f"{COORDINATOR}.port", f"{own[0]}:{own[1]} is already node {taken[own]!r}'s; give each its own port")
 
 
 def _check_action(here: str, entry: Mapping[str, Any], tables: Tables, faults: Faults) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from services.device import Ports
+from services.device import Ports, refuse_unknown_keys
 from services.motion.drive_link import DriveSettings
 from services.motion.model import ArmModel, Cell, nominal_arm, nominal_cell, read_arm, read_cell
 
@@ -25,7 +25,8 @@ class Settings:
 
     @classmethod
     def parse(cls, config: Mapping[str, Any]) -> Settings:
-        """From the device's table; keys that are not the arm's (node, driver, can, ...) are left alone. Raises ValueError."""
+        """From the device's table; keys of its ports (interface, channel, ...) are left alone. Raises ValueError."""
+        refuse_unknown_keys(config, cls.__slots__)
         fields = {name: config[name] for name in cls.__slots__ if name in config}
         for name, value in fields.items():
             kind = type(getattr(_DEFAULTS, name))

@@ -14,12 +14,14 @@ import numpy as np
 
 from services.action import Context
 from services.comm.image import Image
-from services.device import Ports
+from services.device import Ports, refuse_unknown_keys
 from services.vision.calibration_file import DEFAULT, parse_calibration
 from services.vision.location import Background, Detector
 from services.vision.prediction import Surface
 from services.vision.table import TableView
 
+KEYS = ("calibration", "cell", "rate", "threads")
+"""Its own keys in services.toml."""
 CELL = Path(__file__).parents[1] / "cell.toml"
 REMEMBERED = 256
 """Images whose times are remembered, for a tracker that goes on where a locator ended."""
@@ -54,6 +56,7 @@ class Camera:
     period: float | None = None
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
+        refuse_unknown_keys(config, KEYS)
         self._ports = ports
         self._images = ports.images()
         cv2.setNumThreads(int(config.get("threads", 1)))
@@ -64,9 +67,7 @@ class Camera:
         self.view = TableView.of(cell, self.calibration.optics)
         self.surface = Surface.of(cell)
         self.background = Background()
-        self.usual_rate = float(config.get("rate", cell["camera"]["rate"]))
-        if not 0.0 < self.usual_rate <= 1000.0:
-            raise CameraError(f"camera: rate = {self.usual_rate} images/s; give one between 0 and 1000, such as 50")
+        self.usual_rate = _rate(config.get("rate", cell["camera"]["rate"]))
         self._detectors: dict[str, Detector] = {}
         self._times: deque[tuple[int, float]] = deque(maxlen=REMEMBERED)
         self._newest: Image | None = None
@@ -200,6 +201,13 @@ class Camera:
         """Let the source go."""
         self.end()
         self._images.close()
+
+
+def _rate(value: Any) -> float:
+    """Images/s as configured."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value <= 1000.0:
+        raise CameraError(f"camera: rate = {value!r} images/s; give a number above 0 and at most 1000, such as 50")
+    return float(value)
 
 
 def _cell(config: Mapping[str, Any], ports: Ports) -> dict[str, Any]:

@@ -124,6 +124,7 @@ def test_bad_commands_are_refused_and_change_nothing(rig: Any, body: dict[str, A
         ({"speed": "fast"}, "must be of type float"),
         ({"stream_period": -1.0}, "stream_period"),
         ({"enable": 1}, "must be of type bool"),
+        ({"sped": 0.5}, "unknown key 'sped'; did you mean 'speed'"),
     ],
 )
 def test_a_bad_configuration_is_refused(make_rig: Any, config: dict[str, Any], says: str) -> None:

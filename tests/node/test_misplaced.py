@@ -1,0 +1,189 @@
+"""Thirty mistakes that a newcomer makes in the shipped services.toml: each is one line with file, key and remedy, exit code 2."""
+
+from __future__ import annotations
+
+import io
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+
+import pytest
+
+from coordinator.cli import main
+from services.comm.directory import DirectoryError, load, parse
+from services.comm.directory_places import is_loopback, misplaced
+
+SHIPPED = Path(__file__).parents[2] / "services.toml"
+VISION = 'host = "127.0.0.1"\nport = 7301'
+NO_KEY = "can be reached by other hosts, and there is no key; make one with `petrobot keys`"
+MISTAKES: list[tuple[str, str, str]] = [
+    ("port = 7301", "port = 7301.0", ":20: nodes.vision.port: is 7301.0; write a port"),
+    ("port = 7301", 'port = "7301"', ":20: nodes.vision.port: is '7301'; write a port"),
+    ("port = 7302", "port = 7301", ":24: nodes.motion.port: 127.0.0.1:7301 is already node 'vision''s"),
+    (
+        "port = 7302",
+        "port = 7299",
+        "coordinator.port: 127.0.0.1:7299 is already node 'motion''s; give each its own port",
+    ),
+    (
+        "schema = 1",
+        "schema = 1\n[coordinator]\nport = 7301",
+        ":10: coordinator.port: 127.0.0.1:7301 is already node 'vision''s",
+    ),
+    (
+        VISION,
+        'host = "127.0.0.1:7301"\nport = 7301',
+        ":19: nodes.vision.host: is '127.0.0.1:7301'; write a host name or address",
+    ),
+    (VISION, 'host = "300.1.2.3"\nport = 7301', ":19: nodes.vision.host: is '300.1.2.3'; write a host name or address"),
+    (VISION, 'host = "the vision pc"\nport = 7301', ":19: nodes.vision.host: is 'the vision pc'; write a host name"),
+    (VISION, 'host = "192.168.1.5"\nport = 7301', f":19: nodes.vision.host: 192.168.1.5 {NO_KEY}"),
+    (VISION, 'host = "vision-pc"\nport = 7301', f":19: nodes.vision.host: vision-pc {NO_KEY}"),
+    (
+        "schema = 1",
+        'schema = 1\n[keys]\nfile = "lost.key"',
+        ":10: keys.file: {folder}/lost.key is not there; make it with `petrobot keys`",
+    ),
+    ("schema = 1", 'schema = 1\n[keys]\nshared = "cell.key"', ':10: keys.shared: unknown; write file = "cell.key"'),
+    ("[actions.locate_mog2]", "[actions.locate_background]", ":71: actions.locate_background: is placed twice"),
+    ('device = "camera"', 'device = "camera"\nnode = "motion"', ":69: actions.locate_background.node: is on two nodes"),
+    ('device = "camera"', "", ":65: actions.locate_background: is on no node; write device"),
+    (
+        'device = "camera"',
+        'device = "camra"',
+        ":68: actions.locate_background.device: no device is named 'camra'; did you mean 'camera'?",
+    ),
+    (
+        "vision.camera:Camera",
+        "vision.camera:Kamera",
+        ":31: devices.camera.driver: 'services.vision.camera' has no 'Kamera'; did you mean 'Camera'?",
+    ),
+    ("vision.camera:Camera", "vison.camera:Camera", ":31: devices.camera.driver: cannot find 'services.vison.camera'"),
+    (
+        "services.vision.camera:Camera",
+        "our_lab_camera:Camera",
+        ":31: devices.camera.driver: no module 'our_lab_camera' on this host; install",
+    ),
+    (
+        "motion.arm:Arm",
+        "motion.arm.Arm",
+        ":38: devices.arm.driver: is 'services.motion.arm.Arm'; write an import path \"module:Class\"",
+    ),
+    (
+        "actions:locate_background",
+        "actions:locate_backgroud",
+        ":66: actions.locate_background.run: 'services.vision.actions' has no",
+    ),
+    (
+        "laboratory:make_laboratory",
+        "laboratory:make_lab",
+        ":16: nodes.laboratory.sim: 'sim.laboratory' has no 'make_lab'",
+    ),
+    (
+        "deadline = 10.0",
+        'deadline = "10 s"',
+        ":69: actions.locate_background.deadline: is '10 s'; write a number of seconds above 0",
+    ),
+    (
+        "deadline = 12.0",
+        "args = { margn = 5 }",
+        ":125: actions.follow_and_wait.args: follow_and_wait has no argument 'margn'; did you mean 'margin'?",
+    ),
+    ("deadline = 10.0", "args = 5", ":69: actions.locate_background.args: is 5; write a table of arguments"),
+    ('to = "arm"', 'to = "army"', ":49: streams.catch_point.to: no device is named 'army'; did you mean 'arm'?"),
+    ("period = 0.02 ", "period = 0 ", ":50: streams.catch_point.period: is 0; write a number of seconds above 0"),
+    ("period = 0.04 ", "perid = 0.04 ", ":57: timers.image_tick.perid: unknown key; did you mean 'period'?"),
+    ("[services.memory]", '[services.memory]\nscope = "host"', '.scope: is \'host\'; write one of "network", "local"'),
+    (
+        'cell = "services/cell.toml"',
+        'cell = "our_cell.toml"',
+        ":160: parameters.cell: {folder}/our_cell.toml is not there; write the path",
+    ),
+    ("[nodes.vision]", "[node.vision]", ":18: node: unknown table; did you mean 'nodes'?"),
+    ("[nodes.vision]", "[nodes.vision", ":18: not valid TOML"),
+]
+
+
+def told(*command: str) -> tuple[int, str]:
+    """Exit code and all that a command says."""
+    said = io.StringIO()
+    with redirect_stdout(said), redirect_stderr(said):
+        code = main(list(command))
+    return code, said.getvalue()
+
+
+@pytest.mark.parametrize(("right", "wrong", "says"), MISTAKES, ids=[f"{wrong[:40]}" for _, wrong, _ in MISTAKES])
+def test_one_line_says_what_is_wrong(right: str, wrong: str, says: str, tmp_path: Path) -> None:
+    """`petrobot check` refuses it, names file, line, key and remedy, and shows no traceback."""
+    text = SHIPPED.read_text(encoding="utf-8")
+    assert right in text
+    path = tmp_path / "services.toml"
+    path.write_text(text.replace(right, wrong, 1), encoding="utf-8")
+    code, said = told("check", "catch_ball", "--services", str(path))
+    assert code == 2
+    assert says.format(folder=tmp_path) in said
+    assert f"{path}:" in said and "Traceback" not in said
+
+
+def test_the_shipped_files_name_nothing_that_is_not_here(tmp_path: Path) -> None:
+    """Both cells' location files; a copy elsewhere still finds the shipped numbers."""
+    track = SHIPPED.parent / "services" / "mobile" / "track.services.toml"
+    for path in (SHIPPED, track):
+        assert misplaced(load(path)) == misplaced(load(path), everywhere=True) == ()
+    copy = tmp_path / "services.toml"
+    copy.write_bytes(SHIPPED.read_bytes())
+    assert misplaced(load(copy)) == ()
+    own = tmp_path / "services" / "cell.toml"
+    own.parent.mkdir()
+    own.touch()
+    assert load(copy).file("services/cell.toml") == own
+
+
+def test_what_another_host_has_is_not_known_here() -> None:
+    """Only a lock-step cell launches everything here; scripted actions need no code."""
+    text = SHIPPED.read_text(encoding="utf-8").replace("actions:locate_background", "actions:elsewhere", 1)
+    away = parse(text.replace(VISION, 'host = "10.0.0.7"\nport = 7301'), SHIPPED)
+    assert all("no key" in line for line in misplaced(away))
+    assert any("elsewhere" in line for line in misplaced(away, everywhere=True))
+    here = parse(text, SHIPPED)
+    assert any("elsewhere" in line for line in misplaced(here))
+    assert misplaced(here, actions=False) == ()
+
+
+def test_names_that_only_running_the_module_tells_are_let_through(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A module that binds names under a condition, takes any keyword or is no Python source is left to the node's start."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "conditional_lab.py").write_text("import sys\nif sys:\n    look = len\n")
+    (tmp_path / "open_lab.py").write_text("async def look(ctx, **anything): ...\n")
+    (tmp_path / "broken_lab.py").write_text("def look(ctx:\n")
+    text = SHIPPED.read_text(encoding="utf-8")
+    for module in ("conditional_lab", "open_lab", "broken_lab", "math"):
+        run = text.replace("services.vision.actions:locate_background", f"{module}:look", 1)
+        assert misplaced(parse(run.replace("deadline = 10.0", "args = { nosuch = 5 }", 1), SHIPPED)) == ()
+
+
+def test_a_file_in_another_code_is_refused_with_its_line(tmp_path: Path) -> None:
+    """An editor's byte-order mark does no harm; Latin-1 is told."""
+    path = tmp_path / "services.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + SHIPPED.read_bytes())
+    assert load(path).hash == load(SHIPPED).hash
+    path.write_bytes(b"schema = 1\n# K\xf6ln\n")
+    with pytest.raises(DirectoryError, match=r"services.toml:2: not UTF-8 text .*save the file as UTF-8"):
+        load(path)
+
+
+@pytest.mark.parametrize(
+    ("host", "here"),
+    [
+        ("127.0.0.1", True),
+        ("127.0.0.2", True),
+        ("::1", True),
+        ("localhost", True),
+        ("0.0.0.0", False),
+        ("vision-pc", False),
+    ],
+)
+def test_loopback(host: str, here: bool) -> None:
+    """What only this host reaches."""
+    assert is_loopback(host) is here
