@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from services.comm.canbus import Frame
 from services.mobile.model import Sensor
 from services.mobile.odometry import Pose
 
@@ -40,11 +39,11 @@ class Place:
     last: float
 
 
-def parse_echoes(frame: Frame) -> list[tuple[float, float]]:
-    """Bearings (rad) and slant ranges (m) in the sensor's frame. Raises ValueError for one that is none of its."""
-    if len(frame.data) != ECHOES.size:
-        raise ValueError(f"TPDO of the reflector sensor has {len(frame.data)} bytes, must have {ECHOES.size}")
-    b1, r1, b2, r2 = ECHOES.unpack(frame.data)
+def parse_echoes(data: bytes) -> list[tuple[float, float]]:
+    """Bearings (rad) and slant ranges (m) in the sensor's frame, of its TPDO's data. Raises ValueError for what is none."""
+    if len(data) != ECHOES.size:
+        raise ValueError(f"TPDO of the reflector sensor has {len(data)} bytes, must have {ECHOES.size}")
+    b1, r1, b2, r2 = ECHOES.unpack(data)
     return [(b / 1e4, r / 1e3) for b, r in ((b1, r1), (b2, r2)) if r]
 
 

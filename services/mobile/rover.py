@@ -142,7 +142,7 @@ class Rover:
             "element": (self.numbers.track.square, self.numbers.track.radius),
             "sensor": self._master.sensor_alive,
             "limited": self._master.limited,
-            "faults": [(t.cause, t.wheel, t.code, t.text) for t in self._master.troubles],
+            "faults": [(t.cause, self._master.wheel(t), t.code, t.text) for t in self._master.troubles],
             "cycles": self._cycles,
         }
 
@@ -235,13 +235,13 @@ class Rover:
     def _measure(self, now: float) -> None:
         """Odometry and echoes."""
         radius = self.numbers.wheels.wheel_radius
-        left, right = (wheel.turned() * radius for wheel in self._master.wheels)
+        left, right = (wheel.turned() * radius for wheel in self._master.drives)
         self._odometry.add(now, left, right)
         self._measured = 0.5 * (left + right) / self.numbers.bus.period
         self._turning = (right - left) / self.numbers.wheels.track_width / self.numbers.bus.period
         if self._master.echoes:
-            for frame in self._master.echoes:
-                self._reflectors.take(now, self._odometry.pose, parse_echoes(frame))
+            for data in self._master.echoes:
+                self._reflectors.take(now, self._odometry.pose, parse_echoes(data))
             self._master.echoes.clear()
 
     def _look(self, now: float) -> None:

@@ -246,10 +246,10 @@ class TrackMap:
         if not planned:
             ahead, y, w = ahead[:seen], y[:seen], w[:seen]
         d = ahead - x
-        keep = np.abs(d) < reach
-        if np.count_nonzero(keep) < NEEDED:
+        keep = (np.abs(d) < reach).nonzero()[0]
+        if keep.size < NEEDED:
             return None
-        d, y, w = d[keep], y[keep], w[keep]
+        d, y, w = d.take(keep), y.take(keep), w.take(keep)
         part = d * (1.0 / reach)
         part *= part
         np.subtract(1.0, part, out=part)
@@ -266,9 +266,9 @@ class TrackMap:
         cos, sin = math.cos(pose.heading), math.sin(pose.heading)
         dx, dy = points[:, 0] - pose.x, points[:, 1] - pose.y
         x, y = dx * cos + dy * sin, dy * cos - dx * sin
-        keep = (np.abs(x - 0.45) < 0.8) & (np.abs(y) < 0.7)
-        number = np.count_nonzero(keep[: len(seen)])
-        found = x[keep], y[keep], points[keep, 2], int(number)
+        keep = ((np.abs(x - 0.45) < 0.8) & (np.abs(y) < 0.7)).nonzero()[0]
+        number = int(keep.searchsorted(len(seen)))
+        found = x.take(keep), y.take(keep), points[:, 2].take(keep), number
         self._local = (pose, found)
         return found
 

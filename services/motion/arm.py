@@ -147,7 +147,7 @@ class Arm:
             "following_error": self._off_path if self._mode != "off" else 0.0,
             "guard": self._steering.refused,
             "limited": master.limited,
-            "faults": [(trouble.cause, trouble.joint, trouble.code, trouble.text) for trouble in master.troubles],
+            "faults": [(trouble.cause, trouble.axis, trouble.code, trouble.text) for trouble in master.troubles],
             "power": None if master.inputs is None else bool(master.inputs & POWER),
             "ball_in_cup": self._ball.present,
             "barrier": self._ball.interrupted,

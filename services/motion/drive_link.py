@@ -8,13 +8,11 @@ from typing import Final
 from services.comm import canopen
 from services.comm.canbus import Frame
 from services.comm.canopen import SdoClient, Transfer, Type
+from services.comm.canopen_master import Power, pdo_transfers, unfit, usual_transfers
 from services.comm.cia402 import (
-    DEVICE_TYPE,
     ENABLING,
     RECEIVED,
     SENT,
-    SUPPORTED_MODES,
-    Command,
     Mode,
     Object,
     State,
@@ -24,12 +22,8 @@ from services.comm.cia402 import (
     to_units,
 )
 
-MASTER_NODE: Final = 0x7F
-"""Node id under which the master sends its own heartbeat."""
-HEARTBEAT_MS: Final = 50
-"""Period of everybody's heartbeat."""
-HEARTBEAT_PATIENCE_MS: Final = 200
-"""Silence after which a node counts as lost (both ways)."""
+HEARTBEAT_PATIENCE: Final = 0.2
+"""s of silence after which a node counts as lost (both ways)."""
 RESET_CYCLES: Final = 10
 """Cycles between two fault resets."""
 STOP_CYCLES: Final = 125
@@ -39,6 +33,7 @@ SPEED_POLL: Final = 1.0
 LIMITED_POLL: Final = 0.02
 """The same while a drive says that it is too slow for its set points."""
 
+_MODE: Final = Mode.CYCLIC_SYNCHRONOUS_POSITION
 _U8, _U16, _U32, _I8, _I32 = Type.UNSIGNED8, Type.UNSIGNED16, Type.UNSIGNED32, Type.INTEGER8, Type.INTEGER32
 _TPDO: Final = canopen.pdo_struct(SENT)
 _RPDO: Final = canopen.pdo_struct(RECEIVED)
@@ -78,21 +73,14 @@ class DriveLink:
         self._taken = b""
         self._rpdo = canopen.RPDO1_BASE + node
         self._sent: tuple[int, float, Frame] | None = None
-        self._wait = 0
-        self._stopping = 0
+        self._power = Power(RESET_CYCLES, STOP_CYCLES)
 
     def transfers(self, cycle: float) -> list[Transfer]:
         """The configuration of this drive for a bus cycle of so many seconds, and what is read from it."""
-        beat = MASTER_NODE << 16 | HEARTBEAT_PATIENCE_MS
         settings = self.settings
         return [
-            Transfer(Object.DEVICE_TYPE, 0, _U32),
-            Transfer(Object.SUPPORTED_MODES, 0, _U32),
+            *usual_transfers(cycle, _MODE, HEARTBEAT_PATIENCE),
             Transfer(Object.MAX_SPEED, 0, _U32),
-            Transfer(Object.PRODUCER_HEARTBEAT, 0, _U16, HEARTBEAT_MS),
-            Transfer(Object.CONSUMER_HEARTBEAT, 1, _U32, beat),
-            Transfer(Object.SYNC_PERIOD, 0, _U32, round(cycle * 1e6)),
-            Transfer(Object.MODE, 0, _I8, Mode.CYCLIC_SYNCHRONOUS_POSITION),
             Transfer(Object.INTERPOLATION_PERIOD, 1, _U8, round(cycle * 1e3)),
             Transfer(Object.INTERPOLATION_PERIOD, 2, _I8, -3),
             Transfer(Object.SOFTWARE_LIMITS, 1, _I32, to_units(settings.lower)),
@@ -100,19 +88,15 @@ class DriveLink:
             Transfer(Object.FOLLOWING_ERROR_WINDOW, 0, _U32, to_units(settings.following_error)),
             Transfer(Object.FOLLOWING_ERROR_TIMEOUT, 0, _U16, round(settings.following_time * 1e3)),
             Transfer(Object.QUICK_STOP_DECELERATION, 0, _U32, to_units(settings.quick_stop)),
-            *canopen.map_pdo(Object.RPDO1, Object.RPDO1_MAPPING, canopen.RPDO1_BASE + self.node, 1, RECEIVED),
-            *canopen.map_pdo(Object.TPDO1, Object.TPDO1_MAPPING, canopen.TPDO1_BASE + self.node, 1, SENT),
+            *pdo_transfers(self.node, RECEIVED),
         ]
 
     def wrong(self) -> str:
         """What makes the device at this node unfit, in words; empty if nothing. Takes over its greatest speed."""
-        device, modes = self.sdo.results[Object.DEVICE_TYPE, 0], self.sdo.results[Object.SUPPORTED_MODES, 0]
-        if device != DEVICE_TYPE:
-            return f"node {self.node} is no servo drive (object 1000h is {device:#010x}): check the node ids"
-        if not modes & SUPPORTED_MODES:
-            return f"node {self.node} does not know cyclic synchronous position"
-        self.max_speed = from_units(self.sdo.results[Object.MAX_SPEED, 0])
-        return ""
+        wrong = unfit(self.node, self.sdo.results, _MODE)
+        if not wrong:
+            self.max_speed = from_units(self.sdo.results[Object.MAX_SPEED, 0])
+        return wrong
 
     def ask_speed(self, now: float, hurry: bool) -> list[Frame]:
         """Read the drive's greatest speed again when it is time, sooner in a hurry: drives may slow down by themselves."""
@@ -145,11 +129,11 @@ class DriveLink:
 
     def frame(self, target: float, wanted: bool, resetting: bool) -> Frame:
         """The RPDO: a controlword that leads to where the master wants the drive, and the target position (rad)."""
-        self._stopping = 0 if wanted else self._stopping + 1
         if wanted and self.state is State.OPERATION_ENABLED:
+            self._power.stopping = 0
             self.controlword = _GO_ON
         else:
-            self.controlword = self._command(wanted, resetting).word
+            self.controlword = self._power.word(self.state, wanted, resetting)
         return self._frame(self.controlword, target)
 
     def _frame(self, controlword: int, target: float) -> Frame:
@@ -160,16 +144,6 @@ class DriveLink:
             self._sent = sent = controlword, target, frame
         return sent[2]
 
-    def _command(self, wanted: bool, resetting: bool) -> Command:
-        if not wanted:
-            brakes = self.state in _MOVING and self._stopping <= STOP_CYCLES
-            return Command.QUICK_STOP if brakes else Command.DISABLE_VOLTAGE
-        if self.state is State.FAULT:
-            self._wait = (self._wait + 1) % RESET_CYCLES
-            return Command.FAULT_RESET if resetting and self._wait == 1 else Command.DISABLE_VOLTAGE
-        return ENABLING.get(self.state, Command.DISABLE_VOLTAGE)
 
-
-_MOVING: Final = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE)
 _GO_ON: Final = ENABLING[State.OPERATION_ENABLED].word
 """Controlword to a drive that follows its set points."""
