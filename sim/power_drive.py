@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import ClassVar, Final
 
@@ -34,15 +35,16 @@ _ENABLED: Final = State.OPERATION_ENABLED
 _REMOTE, _VOLTAGE, _FOLLOWS = int(StatusBit.REMOTE), int(StatusBit.VOLTAGE_ENABLED), int(StatusBit.FOLLOWS_COMMAND)
 RUNNING: Final = _ENABLED.word | _REMOTE | _VOLTAGE | _FOLLOWS
 """Statusword of a drive that follows its set points, without the bits of its mode."""
-_ENABLE_MASK, _ENABLE = Command.ENABLE_OPERATION.value
+ENABLE_MASK, ENABLE = Command.ENABLE_OPERATION.value
+"""Bits of a controlword that count for the command to follow set points, and their value."""
 
 
 def _calm() -> None:
     """Nobody wants to know."""
 
 
-class PowerDrive(CanopenNode):
-    """One drive without its motor. A subclass names its `mode` and fills `begin`, `ramp_down`, `cut_power` and the other hooks."""
+class PowerDrive(CanopenNode, ABC):
+    """One drive without its motor. A motor's drive names its `mode` and says how it begins, ramps down and loses its torque."""
 
     mode: ClassVar[Mode]
     """The one mode of operation that it knows."""
@@ -63,17 +65,17 @@ class PowerDrive(CanopenNode):
         self._synced = 0.0
 
     # What a motor and its mode of operation add.
+    @abstractmethod
     def begin(self, resumed: bool) -> None:
         """Operation is enabled: let the brake go and take set points; `resumed`: out of a quick stop."""
-        raise NotImplementedError
 
+    @abstractmethod
     def ramp_down(self, deceleration: float) -> None:
         """Come to rest at so many rad/s^2."""
-        raise NotImplementedError
 
+    @abstractmethod
     def cut_power(self) -> None:
         """No torque any more: the brake holds."""
-        raise NotImplementedError
 
     def flags(self) -> int:
         """Bits of the statusword that depend on the mode, while operation is enabled."""
@@ -97,7 +99,7 @@ class PowerDrive(CanopenNode):
         """Obey the controlword."""
         word = self.values[_CONTROLWORD]
         before, self._controlword = self._controlword, word
-        if word & _ENABLE_MASK == _ENABLE and self.state is _ENABLED:
+        if word & ENABLE_MASK == ENABLE and self.state is _ENABLED:
             return  # nothing new
         command = command_of(word)
         if command is Command.FAULT_RESET and before & 0x80:
