@@ -20,6 +20,7 @@ from services.comm.caller import Caller
 from services.comm.client import Client
 from services.comm.credentials import Credentials
 from services.comm.directory import Directory
+from services.comm.latch import ALL, LatchError, latch_of
 from services.comm.messages import Command, Hello
 from services.comm.notice import Answered, Notice, PeerLost
 from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
@@ -49,6 +50,10 @@ class Stopped:
     """Why there is no answer."""
     bus: str = ""
     """What was done on the bus in the node's place."""
+    note: str = ""
+    """What else the node says: that the stop is not kept on its disk."""
+    latch: str = ""
+    """What was kept on disk in the node's place."""
 
     @property
     def answered(self) -> bool:
@@ -83,6 +88,7 @@ class EmergencyLine:
         caller = Caller(node, Hello(OLDEST_VERSION, NEWEST_VERSION, "client", name, name), auto_ack=True)
         self.node = node
         self.why = ""
+        self.note = ""
         self._name = name
         self._numbers = 0
         self._answers: dict[str, asyncio.Future[Mapping[str, Any]]] = {}
@@ -113,6 +119,7 @@ class EmergencyLine:
             return None
         finally:
             self._answers.pop(identity, None)
+        self.note = str(data.get("note") or "")
         answers = data.get("answers")
         if isinstance(answers, Mapping):
             return {str(device): str(answer) for device, answer in answers.items()}
@@ -152,6 +159,8 @@ async def _order(directory: Directory, credentials: Credentials, node: str, verb
             if bus or not stopped.answered:
                 stopped.bus = await _stop_buses(directory, node)
         await asking
+        if verb == STOP and not stopped.answered:
+            stopped.latch = await _latch(directory, node)
     finally:
         await line.close()
     return stopped
@@ -175,11 +184,22 @@ async def _ask(line: EmergencyLine, stopped: Stopped, verb: str) -> None:
                 break
             if stopped.seconds is None:
                 stopped.seconds = loop.time() - begun
-            stopped.devices = answers
+            stopped.devices, stopped.note = answers, line.note or stopped.note
             if "stopping" not in answers.values() or loop.time() - begun > STANDSTILL:
                 return
             await asyncio.sleep(ASK_AGAIN)
     stopped.why = line.why
+
+
+async def _latch(directory: Directory, node: str) -> str:
+    """Keep on disk that the devices of a node are stopped that did not answer: it heeds that when it goes on, or is started."""
+    if not await asyncio.to_thread(is_local, directory.nodes[node].host):
+        return f"not latched: {node} is on another host; run `petrobot estop` there before it is started again"
+    try:
+        path = await asyncio.to_thread(latch_of(directory.source, node).stop, [ALL])
+    except LatchError as fault:
+        return f"not latched: {fault}; do not start {node} again before the cell is safe"
+    return f"latched: {path} keeps its devices stopped until it is up and `petrobot estop --clear` is said"
 
 
 async def _stop_buses(directory: Directory, node: str) -> str:

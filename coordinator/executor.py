@@ -191,6 +191,9 @@ class Executor:
 
     def _choose(self, choose: Choose) -> Chosen:
         if choose.subject is Subject.ACTION:
+            fixed = self.state.overrides.get(choose.of)
+            if fixed is not None:
+                return Chosen(choose.key, fixed, "chosen by the operator")
             offered = tuple(a for a in choose.alternatives if a in self.directory.actions) or choose.alternatives
             return Chosen(choose.key, *self.selector.choose(choose.of, choose.key, offered, self.state.variables))
         draw = np.random.default_rng([self.seed, *choose.key.encode()]).random() * sum(choose.weights)

@@ -136,9 +136,8 @@ class LearningSelector(FirstAlternative):
     def choose(
         self, task: str, run: str, alternatives: tuple[str, ...], variables: Mapping[str, Any] | None = None
     ) -> tuple[str, str]:
-        """The operator's or the user's choice, else the selector's."""
-        fixed = self._overridden.get(task) or self._chosen.get(task)
-        if fixed is not None or task not in self.learning.selectors:
+        """The user's choice, else the selector's. (The operator's own is the executor's: it stands in the engine's state.)"""
+        if task in self._chosen or task not in self.learning.selectors:
             return super().choose(task, run, alternatives, variables)
         context = self.contexts.of(self._values if variables is None else variables)
         rng = np.random.default_rng([self._seed, self._generation, 1, *run.encode()])

@@ -13,7 +13,7 @@ from typing import Any
 
 from coordinator.controls import Answer, Controls
 from coordinator.door_file import Door, door_open
-from coordinator.engine import SetBreakpoints
+from coordinator.engine import Override, SetBreakpoints, Stimulus
 from coordinator.hmi.feed import Feed
 from coordinator.journal import JournalWriter
 from coordinator.launch import Setting, mission_id, realtime_mission, with_runs
@@ -53,7 +53,7 @@ class MissionRun:
         self._shell = RealtimeMission(mission, directory, credentials_of(directory))
         self._operation: Operation | None = None
         self._door: Door | None = None
-        self._stops: tuple[str, ...] = ()
+        self._first: tuple[Stimulus, ...] = ()
         self._closing: asyncio.Task[None] | None = None
 
     async def connect(self) -> None:
@@ -67,15 +67,19 @@ class MissionRun:
         shutil.rmtree(self.folder)
 
     def lead(
-        self, feed: Feed, controls: Controls, door: Callable[[str], Door] | None, stops: Collection[str] = ()
+        self,
+        feed: Feed,
+        controls: Controls,
+        door: Callable[[str], Door] | None,
+        stops: Collection[str] = (),
+        choices: Mapping[str, str] | None = None,
     ) -> None:
-        """Tell it on a feed and let the holder of the controls steer it; `stops` are breakpoints from the beginning."""
+        """Tell it on a feed and let the holder of the controls steer it. `stops` are breakpoints, `choices` the alternatives
+        that the operator has fixed by primitive task, both from the beginning."""
         self._operation = Operation(self._shell, self._selector, feed, controls, starts=True)
         self._door = door(self.identity) if door is not None else None
-        self._stops = tuple(sorted(stops))
-        for primitive, selector in list(feed.state["selectors"].items()):
-            if (choice := self._selector.overridden(primitive)) is not None:
-                feed.emit("selector", name=primitive, selector={**selector, "override": choice})
+        first: list[Stimulus] = [SetBreakpoints(tuple(sorted(stops)))] if stops else []
+        self._first = (*first, *(Override(primitive, action) for primitive, action in (choices or {}).items()))
 
     async def command(self, who: str, verb: str, data: Mapping[str, Any]) -> Answer:
         """Carry out an operator's command."""
@@ -107,8 +111,7 @@ class MissionRun:
         feed.emit("result", result=result)
 
     def _begin(self, now: float) -> None:
-        if self._stops:
-            self._shell.mission.executor.stimulate(now, SetBreakpoints(self._stops))
+        self._shell.mission.executor.stimulate(now, *self._first)
         self._shell.mission.start(now)
 
 

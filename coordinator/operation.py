@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable, Mapping
-from typing import Any
+from typing import Any, Protocol
 
 from coordinator.controls import Answer, Controls, refusal
+from coordinator.emergency import order_all
 from coordinator.engine import (
     Abort,
     AddTokens,
     ForceExit,
     Instruction,
+    Override,
     Pause,
     RaiseEvent,
     RemoveTokens,
@@ -28,15 +30,33 @@ from coordinator.engine import (
 )
 from coordinator.hmi.feed import Feed
 from coordinator.hmi.narrator import Narrator
-from coordinator.mission import Stage
+from coordinator.mission import Mission, Stage
 from coordinator.partners import FirstAlternative
-from coordinator.realtime import RealtimeMission
+from coordinator.realtime import credentials_of
 from coordinator.watching import Watching, shown_selectors
 from services.comm.notice import Progress
 
 ANSWERS = 1.5
 """Seconds that nodes have to answer a pause."""
 REFUSED = frozenset({"refused"})
+_BEFORE = (Stage.CONNECTING, Stage.PREPARING)
+_MAY_COME_EARLY = (SetBreakpoints, Override)
+"""What only says how the run shall go, and moves nothing."""
+
+
+class Shell(Protocol):
+    """What drives a mission run, in real time or in lock step."""
+
+    mission: Mission
+
+    def now(self) -> float:
+        """The mission's clock (s)."""
+
+    def settle(self) -> None:
+        """Something was said: send it, and go on in time."""
+
+    def flush(self, node: str) -> None:
+        """Send what was said to a node."""
 
 
 class Operation:
@@ -44,12 +64,13 @@ class Operation:
 
     def __init__(
         self,
-        shell: RealtimeMission,
+        shell: Shell,
         selector: FirstAlternative,
         feed: Feed | None = None,
         controls: Controls | None = None,
         *,
         starts: bool = False,
+        mode: str = "realtime",
     ) -> None:
         """`feed` and `controls` are those of a page that outlives this run; `starts` says that it can begin another."""
         self.shell = shell
@@ -57,25 +78,30 @@ class Operation:
         self.executor = shell.mission.executor
         self.feed = feed or Feed()
         self.controls = controls or Controls(self.feed)
-        self._selector = selector
         self._refusals: list[str] = []
-        loop = asyncio.get_running_loop()
+        self._stopping: asyncio.Task[None] | None = None
+        self._live = mode == "realtime"
+        began = shell.now()
         where = {name: entry.node for name, entry in self.executor.directory.actions.items()}
-        self.narrator = Narrator(self.feed, self.executor.task, where, loop.time())
+        self.narrator = Narrator(self.feed, self.executor.task, where, began)
         self.narrator.begin(
             self.executor.mission,
-            "realtime",
+            mode,
             starts=starts,
             controls=self.controls.plain(),
             selectors=shown_selectors(self.executor.task, selector),
             nodes=dict(self.feed.state["nodes"]),
         )
+        if self.executor.state.stimuli:
+            self.narrator.adopt(began, self.executor.state)
         self.executor.observers.extend([self.narrator, self])
-        self.watching = Watching(shell, self.feed, selector, loop.time(), lambda: self.feed.watched)
+        self.watching = Watching(shell, self.feed, selector, began, lambda: self.feed.watched)
         self.executor.observers.append(self.watching)
 
     async def close(self) -> None:
         """Ask the nodes no more."""
+        if self._stopping is not None:
+            await asyncio.gather(self._stopping, return_exceptions=True)
         await self.watching.close()
 
     # --- an observer of the executor -------------------------------------------------------------------------------
@@ -178,16 +204,14 @@ class Operation:
         primitive = self.executor.task.primitive_tasks[task]
         if action is not None and action not in primitive.alternatives:
             return refusal("refused", f"{action} is no alternative of {task}: {', '.join(primitive.alternatives)}")
-        self._selector.override(task, action)
-        selector = {**self.feed.state["selectors"].get(task, {}), "override": action}
-        self.feed.emit("selector", name=task, selector=selector)
-        return {"ok": True}
+        return self._order(Override(task, action or ""))
 
     def _order(self, stimulus: Stimulus) -> Answer:
-        if self.mission.stage is not Stage.RUNNING:
+        early = self.mission.stage in _BEFORE and isinstance(stimulus, _MAY_COME_EARLY)
+        if self.mission.stage is not Stage.RUNNING and not early:
             return refusal("idle", f"the mission run is {self.mission.stage.value}")
         self._refusals.clear()
-        self.executor.stimulate(asyncio.get_running_loop().time(), stimulus)
+        self.executor.stimulate(self.shell.now(), stimulus)
         self.executor.store.sync()
         self.shell.settle()
         return refusal("refused", self._refusals[0]) if self._refusals else {"ok": True}
@@ -199,7 +223,17 @@ class Operation:
             self.watching.ask(node, "emergency_stop")
         answer = self._order(Abort(f"emergency stop by {who}"))
         self.feed.emit("mission", mission={"state": "stopped", "reason": f"emergency stop by {who}"})
+        if self._live and (self._stopping is None or self._stopping.done()):
+            self._stopping = asyncio.get_running_loop().create_task(self._stop_again())
         return answer if answer["ok"] or answer["code"] != "idle" else {"ok": True}
+
+    async def _stop_again(self) -> None:
+        """The same past this process's own connections: a node that is away or frozen is stopped by its bus and latched."""
+        directory = self.executor.directory
+        for told in await order_all(directory, credentials_of(directory)):
+            if not told.answered:
+                text = "; ".join(filter(None, (f"{told.node}: {told.why or 'no answer'}", told.bus, told.latch)))
+                self.feed.emit("notice", notice={"level": "error", "text": text, "at": self.feed.state["time"]})
 
     async def _do_clear_estop(self, who: str, data: Mapping[str, Any]) -> Answer:
         """Devices take orders again; nothing moves by that alone."""

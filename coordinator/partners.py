@@ -89,17 +89,6 @@ class FirstAlternative:
 
     def __init__(self, chosen: Mapping[str, str] | None = None) -> None:
         self._chosen = dict(chosen or {})
-        self._overridden: dict[str, str] = {}
-
-    def override(self, task: str, action: str | None) -> None:
-        """The operator chooses for a primitive task from now on; None: free choice again."""
-        self._overridden.pop(task, None)
-        if action is not None:
-            self._overridden[task] = action
-
-    def overridden(self, task: str) -> str | None:
-        """The operator's choice for a primitive task; None where the choice is free."""
-        return self._overridden.get(task)
 
     def figures(self, task: str) -> Mapping[str, Mapping[str, float]]:
         """What people are shown of each alternative: nothing is known here."""
@@ -109,8 +98,6 @@ class FirstAlternative:
         self, task: str, run: str, alternatives: tuple[str, ...], variables: Mapping[str, Any] | None = None
     ) -> tuple[str, str]:
         """The user's choice for this primitive task, else the first."""
-        if task in self._overridden:
-            return self._overridden[task], "chosen by the operator"
         if task in self._chosen:
             return self._chosen[task], "chosen by the user"
         return alternatives[0], "first of the task file"

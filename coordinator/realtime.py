@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
+from typing import Final
 
 from coordinator.journal import JournalError
 from coordinator.mission import Mission, MissionError, Stage
 from services.comm.client import Client
 from services.comm.credentials import COORDINATOR, Credentials, credentials
 from services.comm.directory import Directory
-from services.comm.notice import Notice
+from services.comm.notice import Notice, PeerBack, PeerLost
 
 LINGER = 1.0
 """Seconds that nothing at the end of a run waits for."""
+LEAVE: Final = 2.5
+"""Seconds after the loss of a node in which it may come back to be told good-bye: a little longer than it keeps the leases of
+one who has gone without a word (`services.comm.results.Keeping.lease`)."""
 
 
 class UnreachableError(Exception):
@@ -34,6 +38,7 @@ class RealtimeMission:
         self._closed = False
         self._fault: BaseException | None = None
         self._timer: asyncio.TimerHandle | None = None
+        self._lost_at: dict[str, float] = {}
         key, tls = (proves.key, proves.client()) if proves is not None else (None, None)
         self.clients: Mapping[str, Client] = {
             name: Client(node.host, node.port, mission.callers[name], on_notices=self._hear(name), key=key, tls=tls)
@@ -66,13 +71,26 @@ class RealtimeMission:
             raise self._fault
 
     async def close(self) -> None:
-        """Leave the nodes in good order."""
+        """Leave the nodes in good order: each hears what was not acknowledged yet and a good-bye, which frees its devices for
+        the next run at once. One that was just lost is waited for as long as it would keep them for this one."""
         self._closed = True
         if self._timer is not None:
             self._timer.cancel()
-        for client in self.clients.values():
-            client.flush(self._loop.time() + LINGER)  # acknowledgements that wait for others go now
-        await asyncio.gather(*(client.close() for client in self.clients.values()))
+        await asyncio.gather(*(self._leave(name, client) for name, client in self.clients.items()))
+
+    async def _leave(self, name: str, client: Client) -> None:
+        if (lost := self._lost_at.get(name)) is not None:
+            await client.connected(max(0.0, lost + LEAVE - self._loop.time()))
+        client.flush(self._loop.time() + LINGER)  # acknowledgements that wait for others go now
+        await client.close()
+
+    def now(self) -> float:
+        """The mission's clock (s)."""
+        return self._loop.time()
+
+    def flush(self, node: str) -> None:
+        """Send what was said to a node."""
+        self.clients[node].flush(self.now())
 
     def settle(self) -> None:
         """Send what was said, and wake up in time for what is due next; call it after each use of the mission."""
@@ -92,7 +110,16 @@ class RealtimeMission:
         self._guarded(lambda now: self.mission.advance(now))
 
     def _hear(self, node: str) -> Callable[[float, list[Notice]], None]:
-        return lambda _, notices: self._guarded(lambda now: self.mission.take(now, node, notices))
+        def hear(_: float, notices: list[Notice]) -> None:
+            for notice in notices:
+                if isinstance(notice, PeerLost):
+                    self._lost_at[node] = self._loop.time()
+                elif isinstance(notice, PeerBack):
+                    self._lost_at.pop(node, None)
+            if not self._closed:
+                self._guarded(lambda now: self.mission.take(now, node, notices))
+
+        return hear
 
     def _guarded(self, step: Callable[[float], None]) -> None:
         try:

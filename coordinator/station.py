@@ -196,15 +196,13 @@ class Station:
 
     async def _live(self, task: Task, text: str, parameters: Mapping[str, Any]) -> Answer:
         selector = FirstAlternative()
-        for primitive, action in self._choices.items():
-            selector.override(primitive, action)
         run = MissionRun(self.directory, task, text, parameters, selector, self._runs, self._mock)
         try:
             await run.connect()
         except UnreachableError as fault:
             run.discard()
             return {**refusal("unreachable", str(fault)), "nodes": list(fault.nodes)}
-        run.lead(self.feed, self.controls, self.door, self._stops)
+        run.lead(self.feed, self.controls, self.door, self._stops, self._choices)
         self.feed.emit("mission", mission={"file": self._loaded})
         self._follow(run)
         return {"ok": True, "run": run.identity}

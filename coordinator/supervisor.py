@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import ctypes
+import functools
+import os
 import signal
 import socket
 from collections.abc import Callable, Sequence
@@ -52,8 +54,14 @@ def is_local(host: str) -> bool:
     return True
 
 
-def _end_with_parent() -> None:
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+_LIBC = ctypes.CDLL(None)
+
+
+def _end_with(launcher: int) -> None:
+    """In the child, before it becomes the program: a launcher that ended meanwhile would send no signal any more."""
+    _LIBC.prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+    if os.getppid() != launcher:
+        os._exit(0)
 
 
 class Supervisor:
@@ -154,7 +162,7 @@ class Supervisor:
                 stdin=asyncio.subprocess.DEVNULL,
                 stdout=asyncio.subprocess.PIPE,
                 stderr=log,
-                preexec_fn=_end_with_parent,
+                preexec_fn=functools.partial(_end_with, os.getpid()),
             )
             child.process, child.starts = process, child.starts + 1
             if self._stopping:

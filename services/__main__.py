@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,6 +15,7 @@ from services.comm.lockstep import CellError
 from services.comm.lockstep_process import run_member
 from services.comm.security import KeyFileError, KeyNeededError
 from services.lockstep_node import LockstepNode
+from services.parentage import die_with, wanted_with_parent
 from services.scripted import ScriptError
 from services.scripted import load as load_script
 from services.shell import serve
@@ -68,6 +70,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.mock:
             load_script(options.mock)
         if options.lockstep:
+            if wanted_with_parent():
+                die_with(os.getppid())
             substitutes = load_script(options.mock) if options.mock else None
             party = LockstepNode(directory, options.name, substitutes=substitutes)
             run_member(directory, options.name, party, options.await_coordinator)

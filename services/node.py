@@ -11,11 +11,13 @@ from services.action import Status
 from services.comm.callee import Callee, CancelRun, Commanded, Inline, Offer, Order, StartRun
 from services.comm.caller import Caller
 from services.comm.directory import MEMORY, MEMORY_CALLS, ActionEntry, Directory, DirectoryError, ServiceEntry, resolve
+from services.comm.latch import Latch
 from services.comm.messages import Call, Executed, Hello, Outcome
 from services.comm.notice import Ended as CallEnded
 from services.comm.notice import Notice
 from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
 from services.device import PICTURE
+from services.emergency_stops import NEVER, EmergencyStops
 from services.inline_service import inline_service
 from services.memory import Memory, event_name
 from services.place import InlinePlace, Place
@@ -46,6 +48,8 @@ class _Commanded:
     missing: set[str]
     answers: dict[str, str] = field(default_factory=dict)
     data: dict[str, Any] = field(default_factory=dict)
+    note: str = ""
+    """What else is to be told."""
 
 
 class Node:
@@ -66,9 +70,10 @@ class Node:
         virtual: bool = False,
         connect: Callable[[str], None] | None = None,
         stream_address: Callable[[str], Mapping[str, Any] | None] | None = None,
+        latch: Latch | None = None,
     ) -> None:
         """`connect(peer)` is called when the first call to a peer is about to be made; `stream_address(stream)` tells where a
-        set-point stream of this node is received."""
+        set-point stream of this node is received; `latch` keeps an emergency stop over a restart."""
         self.directory = directory
         self.name = name
         self.boot = boot
@@ -87,8 +92,8 @@ class Node:
         self._at: dict[str, str] = {}
         self._asked: dict[str, str] = {}
         self._commands: dict[str, _Commanded] = {}
-        self._emergency: set[str] = set()
-        """Devices that were stopped in an emergency: no run begins on them until that is cleared."""
+        self._stops = EmergencyStops([key for key in self.places if key not in (LOOP, GENERAL)], latch)
+        self._stop_places(0.0, self._stops.at_start())
 
     def _offers(self, waiting: Mapping[str, ActionEntry]) -> dict[str, Offer]:
         offers = {
@@ -134,17 +139,41 @@ class Node:
     def advance(self, now: float) -> None:
         """Do all that is due: orders of callers, runs, devices, timers, and what comes of them."""
         self._now = now
+        if now >= self._stops.due:
+            self._stop_places(now, self._stops.look(now))
         self._advance_ends(now)
         self.obey(now, self.callee.orders())
         self._answer_runs(now)
+        self.advance_places(now)
+        self.settle(now)
+
+    def advance_places(self, now: float) -> bool:
+        """Timers, runs and devices alone; says whether anything came of it. That is all that `advance` does while nothing has
+        come in and `ends_due` is still to come: a shell that knows may call this instead, then `settle` if something came."""
+        self._now = now
+        news = False
         for name in self._timers.advance(now):
             self.callee.raise_event(now, name, source=name)
+            news = True
         for key, place in self.places.items():
+            if place.idle:
+                continue
             place.advance(now)
             for report in place.reports():
                 self._take_report(now, key, report)
+                news = True
+        return news
+
+    def settle(self, now: float) -> None:
+        """What follows from what `advance_places` has found."""
         self._answer_runs(now)
         self._answer_commands(now)
+
+    def ends_due(self) -> float:
+        """When calls and commands have something to do by time alone, as far as is known now (s)."""
+        dues = [command.due for command in self._commands.values()]
+        dues += [end.soonest for end in (self.callee, *self.callers.values())]
+        return min(*dues, self._stops.due)
 
     def _advance_ends(self, now: float) -> None:
         """What time does at both ends of calls; asking for the next due time keeps `soonest` up to date."""
@@ -156,7 +185,8 @@ class Node:
 
     def due(self) -> float | None:
         """When `advance` has something to do at the latest (s), None if only what comes in can matter."""
-        times = [self.callee.due(), self._timers.due(), *(c.due for c in self._commands.values())]
+        times = [self._stops.due if self._stops.due < NEVER else None]
+        times += [self.callee.due(), self._timers.due(), *(c.due for c in self._commands.values())]
         times += [caller.due() for caller in self.callers.values()]
         times += [place.due() for place in self.places.values()]
         return min((t for t in times if t is not None), default=None)
@@ -185,7 +215,8 @@ class Node:
         deadline = call.deadline
         if deadline is None and action is not None:
             deadline = action.deadline
-        if key in self._emergency:
+        self._stop_places(now, self._stops.look(now))
+        if key in self._stops:
             self.callee.finish(now, call.id, Status.ERROR, {}, EMERGENCY_STOP, IN_EMERGENCY, Executed.NO)
             return
         self._at[call.id] = key
@@ -200,13 +231,22 @@ class Node:
             text = f"{self.name} has no device {command.target!r}"
             self.callee.answer(now, command.id, False, {"cause": "unknown_device", "text": text})
         else:
-            if command.verb == EMERGENCY_STOP:
-                self._emergency.update(key for key in keys if key != GENERAL)
-            elif command.verb == CLEAR_EMERGENCY:
-                self._emergency.difference_update(keys)
+            if command.verb == CLEAR_EMERGENCY and (why := self._stops.clear(keys)):
+                self.callee.answer(now, command.id, False, {"cause": "latched", "text": why})
+                return
             self._commands[command.id] = _Commanded(command.verb, now + ANSWER_WITHIN, set(keys))
             for key in keys:
                 self.places[key].command(now, command.id, command.verb)
+            if command.verb == EMERGENCY_STOP:  # the devices first, the disk then; both before the answer
+                self._commands[command.id].note = self._stops.stop([key for key in keys if key != GENERAL])
+
+    def stopped_in_emergency(self) -> tuple[str, ...]:
+        """Devices that obey nobody until that is cleared."""
+        return self._stops.names
+
+    def _stop_places(self, now: float, keys: Iterable[str]) -> None:
+        for key in keys:
+            self.places[key].command(now, "", EMERGENCY_STOP)
 
     def _answer_commands(self, now: float) -> None:
         if not self._commands:
@@ -216,7 +256,9 @@ class Node:
                 del self._commands[id_]
                 answers = {**command.answers, **{key or self.name: "no answer" for key in command.missing}}
                 held = command.verb != "hold" or all(a in _WELL_HELD for a in answers.values())
-                data = {"answers": answers, "devices": command.data}
+                data: dict[str, Any] = {"answers": answers, "devices": command.data}
+                if command.note:
+                    data["note"] = command.note
                 self.callee.answer(now, id_, held and not command.missing, data)
 
     # --- reports of places -------------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ import asyncio
 import os
 import secrets
 import signal
+import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -15,11 +16,14 @@ from services.comm.callee import Order
 from services.comm.client import Client
 from services.comm.credentials import credentials
 from services.comm.directory import Directory, DirectoryError
+from services.comm.latch import STATE, latch_of
 from services.comm.notice import Notice
 from services.comm.security import require_key
 from services.comm.server import Server
 from services.node import GENERAL, Node, stream_service
+from services.parentage import GOOD_ORDER, outlive, wanted_with_parent
 from services.place import Place
+from services.remote import IN_EMERGENCY
 from services.worker import Setup
 from services.worker_place import WorkerPlace
 
@@ -42,6 +46,7 @@ class NodeShell:
         self._credentials = credentials(directory, name)
         self._workers = {device: self._worker_place(device) for device in self._devices()}
         places: dict[str, Place] = {**self._workers}
+        self.latch = latch_of(directory.source, name)
         self.node = Node(
             directory,
             name,
@@ -50,6 +55,7 @@ class NodeShell:
             places=places,
             connect=self._connect,
             stream_address=self._stream_address,
+            latch=self.latch,
         )
         key, tls = self._credentials.key, self._credentials.server()
         self.server = Server(self.node.callee, on_orders=self._obey, key=key, tls=tls)
@@ -198,15 +204,33 @@ def _tickets(directory: Directory, node: str) -> dict[str, str]:
     return {stream.name: f"{devices[stream.to]}.{secrets.token_hex(16)}" for stream in streams}
 
 
+def _end_with_launcher(launcher: int, over: asyncio.Event) -> None:
+    """End in good order when the launcher is gone; by force if that takes too long, be it that a service hangs in the loop."""
+    outlive(launcher, GOOD_ORDER)
+    try:
+        asyncio.get_running_loop().add_reader(os.pidfd_open(launcher), over.set)
+    except ProcessLookupError:
+        over.set()
+
+
 async def serve(directory: Directory, name: str, text: str, *, mock: str = "", memory: int = 0) -> None:
     """Run a node until SIGTERM or SIGINT; prints one line with `ready` when it serves."""
-    shell = NodeShell(directory, name, text, mock=mock, memory=memory)
     over = asyncio.Event()
     loop = asyncio.get_running_loop()
+    if wanted_with_parent():
+        _end_with_launcher(os.getppid(), over)
+    shell = NodeShell(directory, name, text, mock=mock, memory=memory)
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, over.set)
     await shell.start()
     host, port = shell.server.address
+    if not shell.latch.kept:
+        places = " and ".join(str(path.parent) for path in shell.latch.paths)
+        print(
+            f"node {name}: an emergency stop could not be kept in {places}; name a folder in ${STATE}", file=sys.stderr
+        )
+    if stopped := shell.node.stopped_in_emergency():
+        print(f"node {name}: {', '.join(stopped)}: {IN_EMERGENCY}", file=sys.stderr, flush=True)
     print(f"node {name} ready on {host}:{port}, process {os.getpid()}", flush=True)
     await over.wait()
     await shell.close()

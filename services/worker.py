@@ -7,8 +7,6 @@ node says over the pipe which it is to be. A process that makes its device's dri
 from __future__ import annotations
 
 import contextlib
-import ctypes
-import os
 import resource
 import select
 import selectors
@@ -25,6 +23,7 @@ from services.comm.directory import Directory, DirectoryError, parse
 from services.device import Driver
 from services.device_process import DeviceLoop, take_priority
 from services.drivers import make_driver
+from services.parentage import STOP_ROUTINE, die_with, outlive
 from services.pipe import NewestLink, Pipe
 from services.place import InlinePlace
 from services.ports import ProcessPorts
@@ -37,7 +36,6 @@ POLL = 0.002
 """Seconds between looks at what a run waits for, when it is more than time."""
 READY, FAILED, COMMAND, PING, PONG = "ready", "failed", "command", "ping", "pong"
 WANTED, STREAM_AT = "wanted", "stream_at"
-PR_SET_PDEATHSIG = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,13 +170,6 @@ class Worker:
             raise ConnectionError("the driver's process does not take commands")
 
 
-def end_with(parent: int) -> None:
-    """Be killed when the node is (prctl(2)), also in the middle of an action that hangs."""
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:
-        sys.exit(0)
-
-
 def _first(node: Pipe) -> Setup:
     while True:
         select.select([node], [], [])
@@ -191,6 +182,10 @@ def _first(node: Pipe) -> Setup:
 def serve(node: Pipe, descriptors: socket.socket | None, link: NewestLink | None) -> None:
     """Be what the node says. Faults of the driver go back to it as text."""
     setup = _first(node)
+    if link is None and setup.device:
+        outlive(setup.parent, STOP_ROUTINE)
+    else:
+        die_with(setup.parent)
     if setup.memory:
         resource.setrlimit(resource.RLIMIT_AS, (setup.memory, setup.memory))
     try:
@@ -205,7 +200,6 @@ def serve(node: Pipe, descriptors: socket.socket | None, link: NewestLink | None
             worker = Worker(setup, directory, node, driver=driver, ports=ports)
             streams = ports.stream_ports()
         else:
-            end_with(setup.parent)
             worker, streams = Worker(setup, directory, node, link=link), {}
     except (DirectoryError, OSError, ValueError) as fault:
         node.post([FAILED, str(fault)])

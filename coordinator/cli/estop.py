@@ -108,6 +108,8 @@ def _show(options: argparse.Namespace, answers: list[Stopped], coordinator: str,
             print(f"{answer.node:12} {device:12} {said}")
         if not answer.answered:
             print(f"{answer.node:12} {'':12} NO ANSWER: {answer.why}")
+        for said in filter(None, (answer.note, answer.latch)):
+            print(f"{answer.node:12} {'':12} {said}")
         if answer.bus:
             print(f"{answer.node:12} {'':12} {answer.bus}")
     if coordinator:

@@ -38,6 +38,7 @@ class Draft:
         self.suspended = state.suspended
         self.backlog = list(state.backlog)
         self.breakpoints = state.breakpoints
+        self.overrides = state.overrides
         self.deferred = dict(state.deferred)
         self.told: set[str] = set(state.told)
         self.ending = state.ending
@@ -63,6 +64,7 @@ class Draft:
             suspended=self.suspended,
             backlog=tuple(self.backlog),
             breakpoints=self.breakpoints,
+            overrides=self.overrides,
             deferred=self.deferred,
             told=frozenset(self.told),
             ending=self.ending,

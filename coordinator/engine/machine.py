@@ -31,6 +31,7 @@ from coordinator.engine.stimuli import (
     EventOccurred,
     ForceExit,
     Hold,
+    Override,
     Pause,
     RaiseEvent,
     RemoveTokens,
@@ -52,7 +53,8 @@ from coordinator.engine.timers import elapse, hold_timers_of
 from coordinator.task import Counts, Memory, Scope, Task, VariableType
 
 _AFTER_THE_END = (RunEnded, StopConfirmed, StopFailed, Verdict)
-_ALWAYS_HEARD = (Abort, Verdict, SetBreakpoints)
+_ALWAYS_HEARD = (Abort, Verdict, SetBreakpoints, Override)
+_BEFORE_THE_BEGIN = (Begin, SetBreakpoints, Override)
 
 
 class Engine:
@@ -84,6 +86,7 @@ class Engine:
             Resume: lambda draft, s: operator.go_on(draft, self.policy),
             Step: lambda draft, s: operator.single_step(draft, self.policy),
             SetBreakpoints: operator.set_breakpoints,
+            Override: operator.override,
             AddTokens: lambda draft, s: operator.add_tokens(draft, self.policy, s),
             RemoveTokens: lambda draft, s: operator.remove_tokens(draft, self.policy, s),
             RaiseEvent: self._raise_event,
@@ -140,7 +143,7 @@ class Engine:
         kind = type(stimulus)
         if kind is not Chosen:
             draft.timeless = 0
-        if draft.mode is Mode.FRESH and kind is not Begin and kind is not SetBreakpoints:
+        if draft.mode is Mode.FRESH and kind not in _BEFORE_THE_BEGIN:
             _note(draft, "not_begun", f"{kind.__name__} came before the mission run began")
         elif draft.mode is Mode.FINISHED and not isinstance(stimulus, _AFTER_THE_END):
             _note(draft, "finished", f"{kind.__name__} came after the mission run had ended")
@@ -155,11 +158,11 @@ class Engine:
             return
         draft.mode = Mode.RUNNING
         task = self.compiled.task
+        if stimulus.point is not None:
+            set_out(draft, stimulus.point)
         for name, value in stimulus.parameters.items():
             if name not in task.parameters or not VariableType.of(task.parameters[name]).admits(value):
                 _warn(draft, "bad_parameter", f"{name} = {value!r} is no parameter of {task.name}; ignored", name)
-        if stimulus.point is not None:
-            set_out(draft, stimulus.point)
             else:
                 draft.write(name, value)
         for name, value in stimulus.variables.items():

@@ -10,7 +10,7 @@ from coordinator.engine.firing import Match, arcs_satisfied, fire
 from coordinator.engine.instructions import Marked
 from coordinator.engine.state import LIVE, Mode, Phase, Run
 from coordinator.engine.step import MOVING, Policy, pause, release, resume, settle
-from coordinator.engine.stimuli import AddTokens, ForceExit, RemoveTokens, SetBreakpoints
+from coordinator.engine.stimuli import AddTokens, ForceExit, Override, RemoveTokens, SetBreakpoints
 from coordinator.task import Counts, End, Kind
 
 
@@ -46,6 +46,19 @@ def set_breakpoints(draft: Draft, command: SetBreakpoints) -> None:
         if name not in known:
             refuse(draft, f"{name!r} is no place and no transition{nearest(name, known)}", name)
     draft.breakpoints = frozenset(command.names) & known
+
+
+def override(draft: Draft, command: Override) -> None:
+    """Fix the alternative of a primitive task, or free it; whoever answers a `Choose` looks here first."""
+    name, action = command.primitive_task, command.action
+    primitives = draft.compiled.task.primitive_tasks
+    if name not in primitives:
+        refuse(draft, f"{name!r} is no primitive task{nearest(name, primitives)}", name)
+    elif action and action not in primitives[name].alternatives:
+        refuse(draft, f"{action!r} is no alternative of {name}{nearest(action, primitives[name].alternatives)}", name)
+    else:
+        kept = {task: chosen for task, chosen in draft.overrides.items() if task != name}
+        draft.overrides = {**kept, name: action} if action else kept
 
 
 def pause_net(draft: Draft, reason: str) -> None:

@@ -154,6 +154,8 @@ class State:
     backlog: tuple[Stimulus, ...] = ()
     """Stimuli that came while a draw was outstanding."""
     breakpoints: frozenset[str] = frozenset()
+    overrides: Mapping[str, str] = field(default_factory=dict)
+    """By primitive task: the alternative that the operator has fixed."""
     deferred: Mapping[str, Deferred] = field(default_factory=dict)
     told: frozenset[str] = frozenset()
     """Elements of standing reports that were made already."""

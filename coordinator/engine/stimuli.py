@@ -181,6 +181,14 @@ class SetBreakpoints:
 
 
 @dataclass(frozen=True, slots=True)
+class Override:
+    """Operator: this alternative of a primitive task is run from now on; empty: the choice is free again."""
+
+    primitive_task: str
+    action: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class AddTokens:
     """Operator: put tokens into a control place."""
 
@@ -237,6 +245,7 @@ Stimulus = (
     | Resume
     | Step
     | SetBreakpoints
+    | Override
     | AddTokens
     | RemoveTokens
     | RaiseEvent
@@ -244,5 +253,5 @@ Stimulus = (
     | Abort
 )
 
-OPERATOR = (Pause, Resume, Step, SetBreakpoints, AddTokens, RemoveTokens, RaiseEvent, ForceExit, Abort)
+OPERATOR = (Pause, Resume, Step, SetBreakpoints, Override, AddTokens, RemoveTokens, RaiseEvent, ForceExit, Abort)
 """The stimuli that only the operator who holds the controls may send."""

@@ -31,6 +31,7 @@ from coordinator.engine import (
     State,
     Stimulus,
 )
+from coordinator.engine.state import ACTIVE
 from coordinator.hmi.changes import empty_state
 from coordinator.hmi.feed import Feed
 from coordinator.hmi.picture import picture
@@ -40,6 +41,7 @@ from coordinator.task import End, Scope, Task
 from services.comm.notice import Progress
 
 _AFTER_HOLD = {Hold.HELD: "held", Hold.CANNOT: "running", Hold.STOPPED: "stopping"}
+_GOING = ACTIVE | {Phase.STOPPING, Phase.STUCK}
 _LEVEL = {Severity.NOTE: "info", Severity.WARNING: "warning", Severity.ERROR: "error"}
 
 
@@ -142,6 +144,9 @@ class Narrator:
                     self.feed.emit("variable", time=time, name=name, value=plain_value(value))
         if seen is None or seen.breakpoints != state.breakpoints:
             self.feed.emit("breakpoints", time=time, breakpoints=[self._key(n) for n in sorted(state.breakpoints)])
+        before_overrides = seen.overrides if seen else {}
+        if before_overrides is not state.overrides:
+            self._overrides(time, before_overrides, state.overrides)
         if state.mode in (Mode.RUNNING, Mode.PAUSED) and self.feed.state["mission"]["state"] == "idle":
             self.feed.emit("mission", time=time, mission={"state": "running"})
         if state.mode is Mode.ABORTING and self.feed.state["mission"]["state"] == "running":
@@ -152,12 +157,17 @@ class Narrator:
         """Take over a state that another process left: all of it is told."""
         time = now - self.origin
         self._marking(time, (-1,) * len(state.marking), state.marking)
-        for run in state.runs():
-            if run.phase in (Phase.RUNNING, Phase.STARTING, Phase.HELD):
+        self.feed.emit("mission", time=time, mission={"firings": state.firings})
+        for run in (*state.runs(), *state.stopping.values()):
+            if run.phase in _GOING:
                 primitive = self.task.primitive_task_of(run.place)
                 self._started(
                     time, StartRun(run.id, run.place, primitive.name, run.action, run.arguments, primitive.deadline)
                 )
+                if run.phase not in (Phase.RUNNING, Phase.STARTING):
+                    self._state(time, run.id, "held" if run.phase is Phase.HELD else "stopping")
+        if state.mode is Mode.PAUSED:
+            self._paused(time, Paused("as another process left it"))
         self.settled(now, state)
 
     # --- in the words of the protocol ------------------------------------------------------------------------------
@@ -240,6 +250,8 @@ class Narrator:
     def _finished(self, time: float, finished: Finished) -> None:
         state = "aborted" if self._aborted else finished.status.value
         self.feed.emit("paused", time=time, paused=None)
+        if self.feed.state["mission"]["state"] == "stopped":
+            return  # the emergency stop stands until it is cleared, whatever the run came to
         self.feed.emit("mission", time=time, mission={"state": state, "reason": finished.reason})
 
     def _flags(self, time: float, before: frozenset[str], after: frozenset[str]) -> None:
@@ -247,6 +259,11 @@ class Narrator:
             known = self.feed.state["events"].get(name)
             if known is not None and self.task.flat.events[name].scope is Scope.EXTERNAL:
                 self.feed.emit("event", time=time, name=name, event={**known, "armed": name in after})
+
+    def _overrides(self, time: float, before: Mapping[str, str], after: Mapping[str, str]) -> None:
+        for name in sorted(name for name in {*before, *after} if before.get(name) != after.get(name)):
+            selector = {**self.feed.state["selectors"].get(name, {}), "override": after.get(name)}
+            self.feed.emit("selector", time=time, name=name, selector=selector)
 
     def _key(self, name: str) -> str:
         return f"{'places' if name in self._net.place_index else 'transitions'}.{name}"

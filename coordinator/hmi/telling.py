@@ -12,6 +12,7 @@ from coordinator.engine import (
     Chosen,
     EventOccurred,
     ForceExit,
+    Override,
     Pause,
     RaiseEvent,
     RemoveTokens,
@@ -82,6 +83,12 @@ def told(stimulus: Stimulus | None, cause: str = "") -> str:
             return "operator's step"
         case SetBreakpoints():
             return "breakpoints set"
+        case Override(primitive_task, action):
+            return (
+                f"operator chose {action} for {primitive_task}"
+                if action
+                else f"{primitive_task} is chosen freely again"
+            )
         case Abort():
             return "aborted by the operator"
         case Begin():

@@ -1,9 +1,9 @@
 """Mission runs in real time while everything around them breaks: `storm.py SEED SECONDS FOLDER [--lo]`. Prints one JSON object.
 
-Nodes live under the supervisor of `petrobot up`, each behind a proxy. Seeded weather kills nodes and workers (SIGKILL), freezes
-them (SIGSTOP), cuts, delays and repeats what goes over the wire, drops the coordinator as a crash would (connections aborted, what
-was not written lost), and, in a network namespace of its own (`--lo`), takes the loopback down. Mission runs follow one another,
-resumed after each crash; each is judged by its journal and by what the hands noted. Last comes one in calm weather.
+Nodes live under the supervisor of `petrobot up`, each behind a proxy. Each mission run is a process `petrobot run`. Seeded
+weather kills nodes, workers and the coordinator (SIGKILL; `petrobot resume` then goes on with the run), freezes nodes and workers
+(SIGSTOP), cuts, delays and repeats what goes over the wire, and, in a network namespace of its own (`--lo`), takes the loopback
+down. Mission runs follow one another; each is judged by its journal and by what the hands noted. Last comes one in calm weather.
 """
 
 from __future__ import annotations
@@ -16,8 +16,6 @@ import signal
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,16 +23,14 @@ import numpy as np
 
 from coordinator.cli.loading import load_task
 from coordinator.cli.replaying import recorded
-from coordinator.engine import Fired, RunRecorded, StartRun
-from coordinator.journal import JournalWriter
-from coordinator.launch import Setting, local_programs, mission_id, realtime_mission, resumed_mission, with_runs
-from coordinator.mission import Mission, Stage
-from coordinator.realtime import RealtimeMission, UnreachableError
-from coordinator.recording import JournalStore, clock_reading
-from coordinator.runfolder import JOURNAL, header
+from coordinator.engine import Finished, Fired, RunRecorded, StartRun
+from coordinator.journal import JournalError, read_journal
+from coordinator.launch import local_programs, with_runs
+from coordinator.runfolder import JOURNAL, RESULT
 from coordinator.supervisor import Supervisor
 from coordinator.task import Status
-from services.comm.directory import Directory, load
+from services.comm.directory import load
+from tests.chaos.by_proxy import NODES
 from tests.chaos.shuttle_cell import ROOT, TASK, free_ports, moves, shuttle_services
 from tests.waiting import beat
 
@@ -43,8 +39,12 @@ MARK = "PETROBOT_STORM"
 LONGEST = 90.0
 """Seconds after which a mission run counts as hanging."""
 RUNS = 6
-NODES = ("left", "right")
-CALM = "calm"
+QUIET = ("--quiet", "--no-page")
+KILLS = 4
+"""Times at most that the coordinator of one mission run is killed: it has to come to its end some day."""
+UNREACHABLE, HANGS = 3, 1000
+PATIENCE = 10.0
+"""Seconds that nodes have to notice that everybody has left."""
 
 
 class Weather:
@@ -150,7 +150,8 @@ class Storm:
         self._proxied = free_ports(2)
         self._ends: Counter[str] = Counter()
         self._causes: Counter[str] = Counter()
-        self._unreachable = self._calls = self._resumes = 0
+        self._number = self._calls = 0
+        self._kills = self._resumes = self._unborn = self._unreachable = self._torn = 0
         self._crash = asyncio.Event()
         self._faults: list[str] = []
 
@@ -166,26 +167,29 @@ class Storm:
             async with Supervisor(local_programs(self._directory), self._folder / "logs") as supervisor:
                 weather = Weather(self._seed, supervisor, proxy, self._crash, self._lo)
                 loop = asyncio.get_running_loop()
-                before, end = _sockets(), loop.time() + seconds
+                before, end = _sockets(supervisor), loop.time() + seconds
                 blowing = loop.create_task(weather.blow())
                 while loop.time() < end:
-                    await self._mission(loop.time())
+                    await self._mission()
                 blowing.cancel()
                 await asyncio.gather(blowing, return_exceptions=True)
                 await self._calm(supervisor)
-                left = _sockets() - before
+                left = await self._left(supervisor, before)
         finally:
             proxy.stdin.close()
             await proxy.wait()
         return self._told(weather, left)
 
-    def _told(self, weather: Weather, sockets: int) -> dict[str, Any]:
+    def _told(self, weather: Weather, sockets: dict[str, int]) -> dict[str, Any]:
         begun = moves(self._folder, "begin")
         return {
             "missions": sum(self._ends.values()),
             "ends": dict(self._ends),
+            "killed": self._kills,
             "resumed": self._resumes,
+            "unborn": self._unborn,
             "unreachable": self._unreachable,
+            "torn": self._torn,
             "calls": self._calls,
             "causes": dict(self._causes),
             "weather": dict(weather.seen),
@@ -201,86 +205,83 @@ class Storm:
         """All nodes are up again: a mission run without any error; then no fence was left behind."""
         loop = asyncio.get_running_loop()
         end = loop.time() + LONGEST
+        self._crash.clear()
         while loop.time() < end:
-            if len(supervisor.process_ids()) == len(NODES) and await self._mission(loop.time(), CALM):
+            if len(supervisor.process_ids()) == len(NODES) and await self._mission():
                 return
             await beat(0.2)
         self._faults.append("no calm mission run without error came about")
 
-    async def _mission(self, now: float, name: str = "") -> bool:
-        """One mission run, judged; True if all its runs ended well."""
-        task, mission_name = load_task(str(TASK)), mission_id(load_task(str(TASK)))
-        folder = self._folder / "runs" / mission_name
-        store = JournalStore(JournalWriter(folder / JOURNAL, self._header(mission_name, now)), now)
-        setting = Setting(task, runs=RUNS, seed=self._seed)
-        mission, begin = realtime_mission(self._by_proxy(), setting, mission_name, store), None
-        until = now + LONGEST
-        while not await self._life(mission, begin, until):
-            if mission.stage is Stage.CONNECTING and begin is None:
-                return False
-            mission, begin = self._resumed(folder)
-        if mission.stage is not Stage.OVER:
-            self._faults.append(f"{mission_name} hangs: {mission.executor.state}")
-            return False
-        self._judge(mission, folder)
-        return name != CALM or all(r.status is Status.SUCCESS for r in mission.tally.runs)
-
-    async def _life(self, mission: Mission, begin: Callable[[float], None] | None, until: float) -> bool:
-        """One life of the coordinator: False if it crashed, or its nodes were not there."""
+    async def _left(self, supervisor: Supervisor, before: dict[str, int]) -> dict[str, int]:
+        """Sockets that nodes have more than at first, once those who left have had time to be gone."""
         loop = asyncio.get_running_loop()
-        shell = RealtimeMission(mission, self._by_proxy())
+        end = loop.time() + PATIENCE
+        while True:
+            more = {name: count - before[name] for name, count in _sockets(supervisor).items() if count > before[name]}
+            if not more or loop.time() > end:
+                return more
+            await beat(0.1)
+
+    async def _mission(self) -> bool:
+        """One mission run, judged; True if all its runs ended well."""
+        self._number += 1
+        kept = self._folder / "runs" / f"{self._number}"
+        common = ["--journal", str(kept), "--services", str(self._services), *QUIET]
+        given = ["run", str(TASK), "--runs", str(RUNS), "--seed", str(self._seed), *common]
+        loop = asyncio.get_running_loop()
+        until, kills = loop.time() + LONGEST, 0
+        while (code := await self._life(given, kept, until, mortal=kills < KILLS)) != 0:
+            if code == HANGS:
+                self._faults.append(f"{kept} hangs")
+                return False
+            kills += code == -signal.SIGKILL
+            if not _records(kept):
+                self._unborn += 1
+                return False
+            if code != -signal.SIGKILL and code != UNREACHABLE:
+                break
+            self._resumes += 1
+            given = ["resume", str(next(kept.iterdir())), *QUIET]
+        return self._judge(next(kept.iterdir()), code)
+
+    async def _life(self, given: list[str], kept: Path, until: float, *, mortal: bool) -> int:
+        """One life of the coordinator: its exit code, -9 if the weather has killed it (once it had something to lose)."""
+        before = _records(kept)
+        ports = ",".join(map(str, self._proxied))
+        with (self._folder / "coordinator.txt").open("ab") as out:
+            command = [sys.executable, "-m", "tests.chaos.by_proxy", ports, *given]
+            process = await asyncio.create_subprocess_exec(*command, cwd=ROOT, stdout=out, stderr=out)
+        ending = asyncio.ensure_future(process.wait())
+        while not ending.done() and _records(kept) <= before + 1 and asyncio.get_running_loop().time() < until:
+            await beat(0.02)
         self._crash.clear()
-        try:
-            await shell.connect(10.0)
-        except UnreachableError:
-            self._unreachable += 1
-            self._drop_journal(mission)
-            await shell.close()
-            return loop.time() > until
-        running, crashing = asyncio.ensure_future(shell.run(begin)), asyncio.ensure_future(self._crash.wait())
-        await asyncio.wait({running, crashing}, timeout=until - loop.time(), return_when=asyncio.FIRST_COMPLETED)
-        crashed = crashing.done() and not running.done()
-        for task in (running, crashing):
-            task.cancel()
-        await asyncio.gather(running, crashing, return_exceptions=True)
-        self._drop_journal(mission)
-        if crashed:
-            _vanish(shell)
-        await shell.close()
-        return not crashed
+        crashing = asyncio.ensure_future(self._crash.wait())
+        left = until - asyncio.get_running_loop().time()
+        wanted = {ending, crashing} if mortal else {ending}
+        await asyncio.wait(wanted, timeout=max(0.0, left), return_when=asyncio.FIRST_COMPLETED)
+        hangs = not ending.done() and not (mortal and crashing.done())
+        if not ending.done():
+            self._kills += not hangs
+            _signal(process.pid, signal.SIGKILL)
+        crashing.cancel()
+        await asyncio.gather(ending, crashing, return_exceptions=True)
+        code = HANGS if hangs else await process.wait()
+        self._unreachable += code == UNREACHABLE
+        return code
 
-    @staticmethod
-    def _drop_journal(mission: Mission) -> None:
-        """Let the file go as a dead process does: what was not written is lost, and what is written from now on goes nowhere."""
-        store = mission.executor.store
-        assert isinstance(store, JournalStore)
-        nowhere = os.open(store.writer.path.with_name("lost"), os.O_WRONLY | os.O_CREAT, 0o600)
-        os.dup2(nowhere, store.writer._file)
-        os.close(nowhere)
-
-    def _resumed(self, folder: Path) -> tuple[Mission, Callable[[float], None]]:
-        self._resumes += 1
+    def _judge(self, folder: Path, code: int) -> bool:
+        """The end has a reason, every run one end, every firing is one of the net, the journal says the same again; whether all
+        runs ended well."""
         found = recorded(str(folder))
-        now = asyncio.get_running_loop().time()
-        return resumed_mission(self._by_proxy(), found.task, found.engine, found.journal, [], now)
-
-    def _by_proxy(self) -> Directory:
-        nodes = self._directory.nodes
-        moved = {n: replace(nodes[n], port=port) for n, port in zip(NODES, self._proxied, strict=True)}
-        return replace(self._directory, nodes=moved)
-
-    def _header(self, mission: str, now: float) -> dict[str, Any]:
-        text, services = TASK.read_text(encoding="utf-8"), self._services.read_text(encoding="utf-8")
-        given = {"services_path": str(self._services), "seed": self._seed, "runs": RUNS, "parameters": {}}
-        return header(mission, text, services, "realtime", {**given, "clock": clock_reading(now)})
-
-    def _judge(self, mission: Mission, folder: Path) -> None:
-        """The end has a reason, every run one end, every firing is one of the net, the journal says the same again."""
-        finished = mission.executor.finished
-        assert finished is not None
-        self._ends[finished.status.value] += 1
-        steps = list(recorded(str(folder)).steps())
+        self._torn += found.journal.torn_bytes > 0
+        steps = list(found.steps())
         given = [instruction for step in steps for instruction in step.instructions]
+        finished = next((one for one in given if isinstance(one, Finished)), None)
+        if finished is None or not (folder / RESULT).exists():
+            self._faults.append(f"{folder}: exit code {code} without an end")
+            return False
+        self._ends[finished.status.value] += 1
+        result = json.loads((folder / RESULT).read_text(encoding="utf-8"))
         firings = [one for one in given if isinstance(one, Fired)]
         started = [one.run for one in given if isinstance(one, StartRun)]
         records = [one for one in given if isinstance(one, RunRecorded)]
@@ -290,14 +291,16 @@ class Storm:
         markings = [tuple(m) for m in net.replay([f.transition for f in firings], firings[0].before)]
         checks = {
             "its end has no reason": bool(finished.reason),
+            "its result is another": (result["status"], result["firings"]) == (finished.status.value, len(firings)),
+            "its exit code is another": code == (0 if finished.status is Status.SUCCESS else 1),
             "a firing is none of the net": markings[1:] == [f.after for f in firings],
-            "replay gives another state": steps[-1].state == mission.executor.state,
             "a run was started twice": len(started) == len(set(started)),
             "a run has not one end": sorted(r.run for r in records) == sorted(started),
             "an error has no cause": all(r.cause for r in records if r.status is Status.ERROR),
             "tokens were lost": markings[-1][net.place_index["runs"]] == 0 or finished.status is Status.ERROR,
         }
-        self._faults += [f"{folder.name}: {text}" for text, holds in checks.items() if not holds]
+        self._faults += [f"{folder}: {text}" for text, holds in checks.items() if not holds]
+        return all(r.status is Status.SUCCESS for r in records)
 
 
 def _signal(process: int, number: signal.Signals) -> None:
@@ -306,24 +309,29 @@ def _signal(process: int, number: signal.Signals) -> None:
             os.kill(process, number)
 
 
-def _vanish(shell: RealtimeMission) -> None:
-    """Abort all connections without a word."""
-    for client in shell.clients.values():
-        if client._link is not None:
-            client._link.cut("the coordinator died")
-
-
 def _link(state: str) -> None:
     subprocess.run(["ip", "link", "set", "lo", state], check=True)
 
 
-def _sockets() -> int:
-    """Sockets that this process has open."""
-    count = 0
-    for path in Path("/proc/self/fd").iterdir():
+def _sockets(supervisor: Supervisor) -> dict[str, int]:
+    """Sockets that each node has open."""
+    counts = {}
+    for name, process in supervisor.process_ids().items():
+        counts[name] = 0
         with contextlib.suppress(OSError):
-            count += str(path.readlink()).startswith("socket:")
-    return count
+            for path in Path(f"/proc/{process}/fd").iterdir():
+                with contextlib.suppress(OSError):
+                    counts[name] += str(path.readlink()).startswith("socket:")
+    return counts
+
+
+def _records(kept: Path) -> int:
+    """How many records the journal of a mission run holds behind its header; 0 while there is none."""
+    journal = next(kept.glob(f"*/{JOURNAL}"), None)
+    try:
+        return len(read_journal(journal).records) if journal is not None else 0
+    except JournalError:
+        return 0
 
 
 def _marked() -> list[str]:

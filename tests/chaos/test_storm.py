@@ -37,7 +37,9 @@ def judge(told: dict[str, Any]) -> None:
     assert told["twice"] == [], "an action was executed twice"
     assert told["overlaps"] == [], "two performers for one hand"
     assert told["executed"] <= told["calls"]
-    assert told["processes"] == [] and told["sockets"] <= 0, "something was left behind"
+    assert told["processes"] == [] and told["sockets"] == {}, "something was left behind"
+    leased = sum(times for cause, times in told["causes"].items() if cause.startswith("device_leased"))
+    assert leased <= told["calls"] / 20, "those who have left keep devices from those who come"
 
 
 def namespace_permitted() -> bool:

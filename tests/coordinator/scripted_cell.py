@@ -23,20 +23,21 @@ node = "node"
 """
 
 
-def directory_for(task: Task, extra: str = "") -> Directory:
+def directory_for(task: Task, extra: str = "", every: bool = False) -> Directory:
     """The directory of `services_text`."""
-    return parse(services_text(task) + extra, Path("services.toml"))
+    return parse(services_text(task, every) + extra, Path("services.toml"))
 
 
-def services_text(task: Task) -> str:
-    """A services.toml that places the first alternative of each primitive task on one node."""
+def services_text(task: Task, every: bool = False) -> str:
+    """A services.toml that places the first alternative of each primitive task on one node; every one if asked for."""
     return HEAD + "".join(
-        f'[actions.{p.alternatives[0]}]\nrun = "scripted:nothing"\ntask = "{p.name}"\nnode = "node"\n'
+        f'[actions.{alternative}]\nrun = "scripted:nothing"\ntask = "{p.name}"\nnode = "node"\n'
         for p in task.primitive_tasks.values()
+        for alternative in p.alternatives[: None if every else 1]
     )
 
 
 def scripts(task: Task, lines: Mapping[str, list[Line]]) -> dict[str, Callable[..., Any]]:
-    """A scripted action for the first alternative of each primitive task; half a second of success if none is given."""
+    """A scripted action for every alternative of each primitive task; half a second of success if none is given."""
     usual = [Line(seconds=(0.5, 0.5))]
-    return {p.alternatives[0]: Scripted(lines.get(p.name, usual)) for p in task.primitive_tasks.values()}
+    return {a: Scripted(lines.get(p.name, usual)) for p in task.primitive_tasks.values() for a in p.alternatives}

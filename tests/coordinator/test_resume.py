@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.engine import Engine, Instruction, State, Stimulus
+from coordinator.engine import Engine, Instruction, Override, State, Stimulus
 from coordinator.journal import JournalWriter, read_journal
 from coordinator.launch import Setting, lockstep_party, make_mission, resumed_mission, with_runs
 from coordinator.lockstep_party import CoordinatorParty
@@ -76,7 +76,7 @@ class Laboratory:
 
     def __init__(self, task: Task, folder: Path) -> None:
         self.task, self.folder = task, folder
-        self.directory = directory_for(task)
+        self.directory = directory_for(task, every=True)
         self.executed: Counter[str] = Counter()
         counted = {name: self._counting(action) for name, action in scripts(task, LINES).items()}
         self.node = lockstep_party(self.directory, self.directory.nodes["node"], counted)
@@ -89,11 +89,12 @@ class Laboratory:
 
         return counting
 
-    def begin(self, lives: int) -> tuple[Mission, MortalStore]:
-        """Run until the end or the crash."""
+    def begin(self, lives: int, *first: Stimulus) -> tuple[Mission, MortalStore]:
+        """Run until the end or the crash; `first` is what the operator says before the beginning."""
         header = {"mission": "m", "mode": "lockstep", "seed": 1, "runs": RUNS, "parameters": dict(self.task.parameters)}
         store = MortalStore(JournalWriter(self.folder / "run.journal", header), lives)
         mission = make_mission(self.directory, Setting(self.task, runs=RUNS), "m", "boot-1", store)
+        mission.executor.stimulate(0.0, *first)
         self.go(mission)
         return mission, store
 
@@ -162,6 +163,21 @@ def test_dying_at_every_operation_changes_nothing(catch_ball: Task, tmp_path: Pa
     expected, operations = undisturbed(catch_ball, tmp_path)
     for lives in range(1, operations):
         die_and_resume(catch_ball, tmp_path, lives, expected)
+
+
+def test_what_the_operator_has_chosen_outlives_the_coordinator(catch_ball: Task, tmp_path: Path) -> None:
+    """An override is a stimulus like any other: before and after the crash his alternative is run, and replay says so."""
+    chosen = {"locate_ball": "locate_hough", "track_ball": "predict_kalman"}
+    laboratory = Laboratory(catch_ball, tmp_path)
+    with pytest.raises(CrashError):
+        laboratory.begin(60, *(Override(task, action) for task, action in chosen.items()))
+    before = Counter(laboratory.executed)
+    mission = laboratory.resume()
+    assert mission.executor.state.overrides == chosen
+    ran = {run.partition("#")[0]: action for run, action in mission.tally.chosen.items() if f"m/{run}" not in before}
+    assert {task: ran[task] for task in chosen} == chosen, "runs that only the second process chose"
+    steps = list(replay(read_journal(tmp_path / "run.journal"), Engine(with_runs(catch_ball, RUNS)[0])))
+    assert steps[-1].state == mission.executor.state
 
 
 def test_replay_derives_everything_again(catch_ball: Task, tmp_path: Path) -> None:

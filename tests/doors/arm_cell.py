@@ -139,6 +139,8 @@ class Ear:
         """NMT state of each node, as its heartbeat shows it."""
         self.positions: dict[int, int] = {}
         """Joint angles (micro-radians)."""
+        self.energised = 0
+        """How often a drive has said since `forget` that it has power."""
         self._origin: dict[int, int] = {}
         self.quick_stop_at: float | None = None
         """When a quick stop was first on the bus since `forget`."""
@@ -148,7 +150,7 @@ class Ear:
     def forget(self) -> None:
         """Await the next quick stop, and motion from here."""
         with self._changed:
-            self.quick_stop_at = None
+            self.quick_stop_at, self.energised = None, 0
             self._origin = dict(self.positions)
 
     def until(self, holds: Callable[[Ear], bool], timeout: float = 30.0) -> None:
@@ -199,6 +201,7 @@ class Ear:
         elif base == canopen.TPDO1_BASE and node in DRIVES:
             status, self.positions[node], _ = self._tpdo.unpack(frame.data)
             self.states[node] = state_of(status)
+            self.energised += self.states[node] in (State.SWITCHED_ON, State.OPERATION_ENABLED)
         elif base == canopen.HEARTBEAT_BASE and frame.data:
             self.nmt[node] = frame.data[0]
 

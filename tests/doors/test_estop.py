@@ -24,6 +24,7 @@ from services.comm.canopen import NmtState
 from services.comm.cia402 import State
 from services.comm.directory import Directory
 from tests.doors.arm_cell import DRIVES, ROOT, Ear, cell_in, ear_on
+from tests.waiting import beat
 
 pytestmark = pytest.mark.processes
 LIMIT = 60.0
@@ -68,10 +69,19 @@ class Cell:
         """Let a coordinator move the arm, until it really moves."""
         await self.heard(lambda ear: len(ear.positions) == len(DRIVES))
         self.ear.forget()
-        services = ["--services", str(self.directory.source), "--journal", str(self.runs)]
-        task = str(self.folder / "sweeping.toml")
-        self.coordinator = petrobot("run", task, "--runs", "3", *services, "--no-page", "--quiet")
+        self.coordinator = self.task()
         await self.heard(Ear.moving)
+
+    def task(self) -> subprocess.Popen[str]:
+        """A coordinator that would move the arm."""
+        services = ["--services", str(self.directory.source), "--journal", str(self.runs)]
+        return petrobot("run", str(self.folder / "sweeping.toml"), "--runs", "3", *services, "--no-page", "--quiet")
+
+    async def until(self, holds: Callable[[], bool]) -> None:
+        """Wait until something holds."""
+        async with asyncio.timeout(LIMIT):
+            while not holds():
+                await beat()
 
     async def estop(self, *options: str) -> tuple[int, Any]:
         """`petrobot estop`; its exit code and answers."""
@@ -89,11 +99,16 @@ class Cell:
                 return
 
 
+def without_power(ear: Ear) -> bool:
+    """Whether no drive has power: a drive whose master dies is in FAULT until it is reset."""
+    return all(ear.states.get(n) in (State.SWITCH_ON_DISABLED, State.FAULT) for n in DRIVES)
+
+
 @asynccontextmanager
-async def cell_of(folder: Path) -> AsyncIterator[Cell]:
+async def cell_of(folder: Path, *, respawn: bool = False) -> AsyncIterator[Cell]:
     """Laboratory and motion node as processes."""
     directory = cell_in(folder)
-    async with Supervisor(local_programs(directory), folder / "logs", respawn=False) as supervisor:
+    async with Supervisor(local_programs(directory), folder / "logs", respawn=respawn) as supervisor:
         with ear_on(directory) as ear:
             cell = Cell(folder, directory, supervisor, ear)
             try:
@@ -147,6 +162,31 @@ async def test_estop_reaches_the_bus_though_the_node_is_frozen(tmp_path: Path) -
         assert code == 3 and node["seconds"] is None
         assert node["bus"].endswith("all devices stopped by NMT")
         await cell.heard(lambda ear: [ear.nmt.get(n) for n in DRIVES] == [NmtState.STOPPED] * len(DRIVES))
+
+
+@pytest.mark.parametrize("answers", [True, False], ids=["told itself", "frozen when it was to be told"])
+async def test_a_stop_outlives_its_node(tmp_path: Path, answers: bool) -> None:
+    """The node is killed (kill -9) and started again: the drives stay without power, whatever a task tries, until it is cleared."""
+    async with cell_of(tmp_path, respawn=True) as cell:
+        await cell.sweep()
+        assert cell.coordinator is not None
+        if not answers:
+            os.kill(cell.supervisor.process_ids()["motion"], signal.SIGSTOP)
+        code, told = await cell.estop()
+        (node,) = told["nodes"]
+        assert code == (0 if answers else 3) and node["latch"].startswith("" if answers else "latched")
+        assert (await finished(cell.coordinator))[0] == 1
+        os.kill(cell.supervisor.process_ids()["motion"], signal.SIGKILL)
+        log = tmp_path / "logs" / "motion.log"
+        await cell.until(lambda: log.read_text().count("motion ready on") == 2)
+        assert "petrobot estop --clear" in log.read_text(), "whoever starts it sees why nothing moves"
+        await cell.heard(without_power)
+        cell.ear.forget()
+        code, out, err = await finished(cell.task())
+        assert code == 1, out + err
+        assert without_power(cell.ear) and cell.ear.energised == 0, "not even for a moment"
+        assert (await cell.estop("--clear"))[0] == 0
+        await cell.sweep()
 
 
 async def test_estop_without_nodes_says_so(tmp_path: Path) -> None:

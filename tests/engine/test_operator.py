@@ -13,6 +13,7 @@ from coordinator.engine import (
     AddTokens,
     ArmTimer,
     CancelRun,
+    Choose,
     Chosen,
     EventOccurred,
     ForceExit,
@@ -20,6 +21,7 @@ from coordinator.engine import (
     HoldRun,
     HoldTimer,
     Marked,
+    Override,
     Pause,
     Paused,
     RaiseEvent,
@@ -30,12 +32,15 @@ from coordinator.engine import (
     RunEnded,
     RunHeld,
     RunRecorded,
+    RunStarted,
     SetBreakpoints,
     StartRun,
     Step,
     StopConfirmed,
     TimerFired,
     VariableChanged,
+    state_from_plain,
+    to_plain,
 )
 from coordinator.task import Reference, Status
 
@@ -151,6 +156,26 @@ def test_unknown_breakpoint_is_refused_and_the_others_set(play: Plays) -> None:
     p = play("x=1 a! b! y", LINE, "e")
     p(SetBreakpoints(("gone", "good")))
     assert p.reports == ["refused"] and p.state.breakpoints == {"good"}
+
+
+def test_an_override_is_kept_for_the_primitive_task_until_it_is_given_back(play: Plays) -> None:
+    """Also before the beginning; what is no task or no alternative is refused and changes nothing."""
+    p = play("x=1 a! b! y", LINE, "e", alternatives={"a": ("do_a", "do_a_slowly")})
+    p(Override("a", "do_a_slowly"), Override("a", "do_b"), Override("nothing", "do_a"))
+    assert p.state.overrides == {"a": "do_a_slowly"} and p.reports == ["refused", "refused"]
+    p(EventOccurred("e"))
+    assert p.of(Choose)[0].of == "a", "the choice is still put, so that it is recorded with its reason"
+    p(Override("a"))
+    assert p.state.overrides == {} and state_from_plain(to_plain(p.state)) == p.state
+
+
+def test_a_net_taken_over_while_paused_asks_every_run_to_hold_again(play: Plays) -> None:
+    """Whoever paused it may have died before the nodes had answered, or before they were asked."""
+    p = play("x=1 a! b! y", LINE, "e")
+    p(EventOccurred("e"), RunStarted("a#1"), Pause("by hand"))
+    assert [type(order) for order in p.engine.outstanding(p.state)] == [StartRun, HoldRun]
+    p(Resume())
+    assert [type(order) for order in p.engine.outstanding(p.state)] == [StartRun]
 
 
 def test_tokens_go_into_and_out_of_control_places_only(play: Plays) -> None:

@@ -30,6 +30,7 @@ from coordinator.engine import (
     Instruction,
     Marked,
     Mode,
+    Override,
     Pause,
     Policy,
     RaiseEvent,
@@ -273,7 +274,14 @@ class Journal:
     def commands(self) -> list[Stimulus]:
         """What the operator could do, and what global memory could say."""
         found: list[Stimulus] = [Pause(), Resume(), Resume(), Step(), Step(), SetBreakpoints(), RaiseEvent("tick")]
-        found += [AddTokens("c0"), RemoveTokens("c0"), AddTokens("a0"), SetBreakpoints(("t0", "a0")), ForceExit("t0")]
+        found += [
+            AddTokens("c0"),
+            RemoveTokens("c0"),
+            AddTokens("a0"),
+            SetBreakpoints(("t0", "a0")),
+            Override("a0", "do_a0"),
+            ForceExit("t0"),
+        ]
         found += [ForceExit("t1"), VariableChanged("b", True), VariableChanged("b", False), VariableChanged("b", "odd")]
         return found + [VariableChanged("n", n) for n in (0, 1, 3)] + [Abort("enough")]
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from coordinator.engine import Stimulus
 from coordinator.launch import Setting, lockstep_cell
 from coordinator.learner import LearningSelector
 from coordinator.mission import Mission
@@ -73,11 +74,13 @@ def run(
     seed: int = 1,
     parameters: Mapping[str, Any] | None = None,
     store: Store | None = None,
+    first: Sequence[Stimulus] = (),
 ) -> Mission:
-    """Run to the end, at most an hour of simulated time."""
+    """Run to the end, at most an hour of simulated time; `first` is what the operator says before the beginning."""
     setting = Setting(task, parameters or {}, runs, seed, selector or FirstAlternative())
     cell, party = lockstep_cell(directory(task), setting, scripts())
     if store is not None:
         party.mission.executor.store = store
+    party.mission.executor.stimulate(0.0, *first)
     assert cell.run(lambda: party.over, 900_000)
     return party.mission

@@ -12,7 +12,7 @@ from typing import Any, cast
 
 import pytest
 
-from coordinator.engine import Engine, State
+from coordinator.engine import Engine, Override, State
 from coordinator.engine.instructions import Corrected, RunRecorded, StartRun
 from coordinator.journal import JournalWriter, read_journal
 from coordinator.launch import Setting, lockstep_cell, with_runs
@@ -158,13 +158,11 @@ def test_a_context_that_cannot_be_told_is_refused(task: Task, part: str, said: s
 
 
 def test_the_users_and_the_operators_choice_come_first(task: Task) -> None:
-    """Both are counted as what they are, and say so."""
+    """Both are counted as what they are, and say so. The operator's is answered by the executor, which journals it."""
     selector = learner(task, seed=1, chosen={"pick": "pick_slow"})
-    selector.override("place", "place_hard")
-    run(task, selector, runs=4)
+    run(task, selector, runs=4, first=[Override("place", "place_hard")])
     assert {r.action for r in selector.records if isinstance(r, Choice)} == {"pick_slow", "place_hard"}
     assert selector.choose("pick", "pick#9", ("pick_fast", "pick_slow"))[1] == "chosen by the user"
-    assert selector.choose("place", "place#9", ("place_soft",))[1] == "chosen by the operator"
     assert selector.learning.selectors["pick"].learner("regime=A").runs[0, 1] == 4
 
 
@@ -247,7 +245,7 @@ async def test_the_operators_page_follows_the_learning(task: Task) -> None:
     selector = learner(task, seed=1)
     setting = Setting(task, {}, 12, 1, selector)
     cell, party = lockstep_cell(directory(task), setting, scripts())
-    operation = Operation(cast(RealtimeMission, SimpleNamespace(mission=party.mission)), selector)
+    operation = Operation(cast(RealtimeMission, SimpleNamespace(mission=party.mission, now=lambda: 0.0)), selector)
     before = operation.snapshot()["selectors"]["pick"]["alternatives"]
     assert [a["action"] for a in before] == ["pick_fast", "pick_slow", "pick_blind"]
     assert all("probability" in a and "reliability" not in a for a in before)

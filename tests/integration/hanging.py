@@ -1,0 +1,71 @@
+"""Toys that hang for good, as badly as a process can: in C, with the interpreter held, so that nothing of Python runs any more."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from services.action import Context, Result, success
+
+FOR_EVER = 1_000_000
+_HOLDING_THE_INTERPRETER = ctypes.PyDLL(None)
+
+
+def hang() -> None:
+    """Never come back, and let nobody else run."""
+    while True:
+        _HOLDING_THE_INTERPRETER.sleep(FOR_EVER)
+
+
+class Stand:
+    """A device that hangs in its cycle once a file is there; without `period` in its configuration it has no cycle."""
+
+    def __init__(self, config: Mapping[str, Any], ports: object) -> None:
+        self.period = config.get("period")
+        self._hangs = Path(str(config["hangs"]))
+
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        """Takes none."""
+
+    def step(self, now: float) -> None:
+        """Hang, if it is time for that."""
+        if self._hangs.exists():
+            self._hangs.with_suffix(".hung").touch()
+            hang()
+
+    def state(self) -> Mapping[str, Any]:
+        """Nothing to tell."""
+        return {}
+
+    def stop(self, now: float) -> None:
+        """It stands."""
+
+    def stopped(self) -> bool:
+        """It stands."""
+        return True
+
+    def hold(self, now: float) -> str:
+        """It stands."""
+        return "held"
+
+    def release(self, now: float) -> None:
+        """It stands."""
+
+    def close(self) -> None:
+        """Nothing to let go."""
+
+
+async def hang_in_action(ctx: Context, mark: str) -> Result:
+    """Say that it hangs, and hang."""
+    Path(mark).touch()
+    hang()
+    return success()
+
+
+def hang_in_service(ctx: Context, mark: str) -> Result:
+    """A quick service that is none: it hangs in its node's own loop."""
+    Path(mark).touch()
+    hang()
+    return success()

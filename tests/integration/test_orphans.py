@@ -1,0 +1,158 @@
+"""No process outlives its parent: each parent is killed (kill -9) while its children hang as badly as can be, and all are gone."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from services.comm.caller import Caller
+from services.comm.client import Client
+from services.comm.directory import load
+from services.comm.messages import Call, Hello
+from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
+from tests.chaos.shuttle_cell import free_ports
+from tests.integration.test_resume_processes import nodes
+from tests.waiting import beat
+
+pytestmark = pytest.mark.processes
+PATIENCE = 60.0
+SERVICES = """
+schema = 1
+[nodes.motion]
+host = "127.0.0.1"
+port = {port}
+[devices.servo]
+node = "motion"
+driver = "tests.integration.hanging:Stand"
+period = 0.01
+hangs = "{folder}/servo"
+[devices.hand]
+node = "motion"
+driver = "tests.integration.hanging:Stand"
+hangs = "{folder}/hand"
+[services.quick]
+node = "motion"
+run = "tests.integration.hanging:hang_in_service"
+[actions.with_servo]
+run = "tests.integration.hanging:hang_in_action"
+task = "hang"
+device = "servo"
+args = {{ mark = "{folder}/with_servo" }}
+[actions.with_hand]
+run = "tests.integration.hanging:hang_in_action"
+task = "hang"
+device = "hand"
+args = {{ mark = "{folder}/with_hand" }}
+[actions.alone]
+run = "tests.integration.hanging:hang_in_action"
+task = "hang"
+node = "motion"
+args = {{ mark = "{folder}/alone" }}
+"""
+ACTIONS = ("with_servo", "with_hand", "alone")
+
+
+def until(holds: Callable[[], bool], what: str) -> None:
+    """Wait for a condition."""
+    deadline, pause = time.monotonic() + PATIENCE, threading.Event()
+    while not holds():
+        assert time.monotonic() < deadline, what
+        pause.wait(0.01)
+
+
+def below(process: int) -> set[int]:
+    """All processes that descend from this one."""
+    try:
+        children = Path(f"/proc/{process}/task/{process}/children").read_text().split()
+    except OSError:
+        return set()
+    found = {int(child) for child in children}
+    return found.union(*(below(child) for child in found)) if found else found
+
+
+def alive(processes: set[int]) -> list[str]:
+    """Command lines of those that still run (a zombie does not)."""
+    found = []
+    for process in processes:
+        try:
+            state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
+            line = Path(f"/proc/{process}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+        except OSError:
+            continue
+        if state not in "ZX":
+            found.append(f"{process} {state} {line}")
+    return found
+
+
+async def call(folder: Path, names: tuple[str, ...]) -> None:
+    """Call these actions and services of the node, and wait until each says that it hangs."""
+    directory = load(folder / "services.toml")
+    hello = Hello(OLDEST_VERSION, NEWEST_VERSION, "coordinator", "tester", "tester", 1, directory.hash)
+    caller = Caller("motion", hello)
+    client = Client(*directory.address("motion"), caller)
+    client.start()
+    assert await client.connected(PATIENCE)
+    for name in names:
+        arguments = dict(directory.actions[name].args) if name in directory.actions else {"mark": str(folder / name)}
+        caller.call(client.now(), Call(f"tester/{name}", name, arguments, PATIENCE))
+        client.flush()
+        await asyncio.to_thread(until, (folder / name).exists, f"{name} was not called")
+    await client.close()
+    await beat()
+
+
+@contextmanager
+def hanging_cell(folder: Path) -> Iterator[tuple[int, int]]:
+    """`petrobot up` over a node whose servo process, workers and general worker all hang; both process ids."""
+    (folder / "services.toml").write_text(SERVICES.format(port=free_ports(1)[0], folder=folder), encoding="utf-8")
+    launcher = nodes(folder)
+    family = below(launcher.pid)
+    try:
+        [node] = Path(f"/proc/{launcher.pid}/task/{launcher.pid}/children").read_text().split()
+        asyncio.run(call(folder, ACTIONS))
+        (folder / "servo").touch()
+        until((folder / "servo.hung").exists, "the servo does not hang")
+        yield launcher.pid, int(node)
+    finally:
+        for process in {launcher.pid, *family, *below(launcher.pid)}:
+            if alive({process}):
+                os.kill(process, signal.SIGKILL)
+        launcher.wait(PATIENCE)
+
+
+def test_a_node_that_is_killed_leaves_no_process(tmp_path: Path) -> None:
+    """Servo process, the worker at its link, a worker with its device, one without: all hang with the interpreter held."""
+    with hanging_cell(tmp_path) as (launcher, node):
+        os.kill(launcher, signal.SIGSTOP)  # so that it starts no other, and reaps nothing
+        children = below(node)
+        assert len(children) == 4
+        os.kill(node, signal.SIGKILL)
+        until(lambda: not alive(children), f"left behind: {alive(children)}")
+
+
+def test_a_launcher_that_is_killed_leaves_no_process(tmp_path: Path) -> None:
+    """Its node hangs, too, in a service of its own loop, with the interpreter held: SIGTERM does nothing to it."""
+    with hanging_cell(tmp_path) as (launcher, node):
+        asyncio.run(call(tmp_path, ("quick",)))
+        family = below(launcher)
+        assert node in family and len(family) == 5
+        os.kill(launcher, signal.SIGKILL)
+        until(lambda: not alive(family), f"left behind: {alive(family)}")
+
+
+def test_a_lock_step_node_ends_with_its_launcher(tmp_path: Path) -> None:
+    (tmp_path / "services.toml").write_text(SERVICES.format(port=free_ports(1)[0], folder=tmp_path), encoding="utf-8")
+    launcher = nodes(tmp_path, "--lockstep")
+    family = below(launcher.pid)
+    assert len(family) == 1
+    os.kill(launcher.pid, signal.SIGKILL)
+    launcher.wait(PATIENCE)
+    until(lambda: not alive(family), f"left behind: {alive(family)}")
