@@ -80,6 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run or resume the campaign; print and write its result."""
     from coordinator.campaign.conduct import Campaign
+    from coordinator.campaign.lock import held
     from coordinator.campaign.plan import CampaignError, identity, read_manifest
     from coordinator.campaign.progress import ProgressLine
     from coordinator.campaign.table import write_parquet
@@ -98,14 +99,17 @@ def run(options: argparse.Namespace) -> int:
             plan = _plan(options, task)
             folder = options.out or Path("campaigns") / f"{task.name}-{plan.selector}-{plan.seed}-{identity(plan)[:6]}"
         campaign = Campaign(folder, plan, shown)
-        if campaign.complete and options.json != "-":
-            print(f"nothing left to do: {folder} holds all runs; remove it, or give another --out, to run them again")
-        try:
-            asyncio.run(_conduct(campaign, options))
-        finally:
-            shown.close()
-        result = campaign.result()
-        write_parquet(folder)
+        with held(folder):
+            if campaign.complete and options.json != "-":
+                print(
+                    f"nothing left to do: {folder} holds all runs; remove it, or give another --out, to run them again"
+                )
+            try:
+                asyncio.run(_conduct(campaign, options))
+            finally:
+                shown.close()
+            result = campaign.result()
+            write_parquet(folder)
         check = None if options.check is None else _checked(options.check, folder)
     except CampaignError as fault:
         raise CommandError(2, str(fault)) from fault

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from coordinator.campaign.conduct import Progress
+from coordinator.campaign.lock import held
 from coordinator.campaign.progress import ProgressLine, clock, line
 from coordinator.cli import main
 from tests.campaign.conftest import HERE, SERVICES, TASK
@@ -169,6 +170,20 @@ def test_bad_input(
 
 
 # --- progress ------------------------------------------------------------------------------------------------------------
+
+
+def test_two_at_once_do_not_write_one_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The second is told who is at it, and touches nothing; a lock whose holder is gone stands in nobody's way."""
+    folder = tmp_path / "one"
+    campaign(folder, "--runs", "3")
+    before = (folder / "table.csv").read_bytes()
+    (folder / "table.csv").write_bytes(before + b"half a row of the one that is at it")
+    with held(folder):
+        assert main(["campaign", *TOY, "--out", str(folder), "--workers", "1", "--runs", "3"]) == 2
+    assert f"process {os.getpid()} is running this campaign" in capsys.readouterr().err
+    assert (folder / "table.csv").read_bytes() != before
+    campaign(folder, "--runs", "3")
+    assert (folder / "table.csv").read_bytes() == before
 
 
 def test_progress_line() -> None:
