@@ -104,14 +104,23 @@ class Caller:
         if arguments:
             arguments = plain(arguments, "arguments")
         call = m.Call(id, service, arguments, deadline, epoch or self.hello.epoch, boot or self.boot, parent, seed)
-        pending = self._pending[id] = Pending(call, not boot, now, waiter)
         if self.up:
-            self._send(now, pending)
-        elif self._refusal:
-            self._end(id, "refused", self._refusal, pending.if_unsent)
-        elif self._held_until is None or now >= self._held_until:
-            self._end(id, "unreachable", f"{self.peer} is not there", pending.if_unsent)
+            due = now + self._patience.accept
+            self._pending.begin(Pending(call, not boot, now, waiter, True, False, None, due))
+            self._messages.append(call)
+            if due < self.soonest:
+                self.soonest = due
+        else:
+            self._begin_unsent(now, Pending(call, not boot, now, waiter))
         return len(self._messages)
+
+    def _begin_unsent(self, now: float, pending: Pending) -> None:
+        id_ = pending.call.id
+        self._pending[id_] = pending
+        if self._refusal:
+            self._end(id_, "refused", self._refusal, pending.if_unsent)
+        elif self._held_until is None or now >= self._held_until:
+            self._end(id_, "unreachable", f"{self.peer} is not there", pending.if_unsent)
 
     def cancel(self, now: float, id: str, reason: str = "", within: float | None = None) -> None:  # noqa: A002
         """Ask for a call's run to be stopped; it still ends with one `Ended`, `no_answer` if the peer does not say so
@@ -319,10 +328,8 @@ class Caller:
 
     def due(self) -> float | None:
         """When `advance` has something to do next (s), None if never."""
-        soonest = min(self._pending.due(), self._settled.due, min(self._commands.values(), default=NEVER))
-        if self._held_until is not None:
-            soonest = min(soonest, self._held_until)
-        self.soonest = soonest
+        held_until = NEVER if self._held_until is None else self._held_until
+        self.soonest = soonest = min(self._pending.due(), self._settled.due, held_until, *self._commands.values())
         return soonest if soonest < NEVER else None
 
     @property
@@ -339,15 +346,11 @@ class Caller:
         """What to send, in order; each message is given once. Acknowledgements wait for others until `now` reaches theirs."""
         if now is None or now >= self._settled.due:
             self._messages += self._settled.take_acks()
-        if not self._messages:
-            return []
         messages, self._messages = self._messages, []
         return messages
 
     def notices(self) -> list[Notice]:
         """What the owner should know, in order; each notice is given once."""
-        if not self._notices:
-            return []
         notices, self._notices = self._notices, []
         return notices
 
@@ -355,13 +358,11 @@ class Caller:
         call = pending.call
         if pending.any_boot and call.boot != self.boot:
             call = pending.call = replace(call, boot=self.boot)
-        pending.sent = True
-        pending.accepted = False
+        pending.sent, pending.accepted = True, False
         due = now + self._patience.accept
         self._pending.watch_accept(pending, due)
         self._messages.append(call)
-        if due < self.soonest:
-            self.soonest = due
+        self.soonest = min(self.soonest, due)
 
     def _watch(self, pending: Pending, due: float) -> None:
         self._pending.watch_result(pending, due)
@@ -370,8 +371,7 @@ class Caller:
     def _ack(self, now: float, *ids: str) -> None:
         if self.up:
             self._settled.acknowledge(now, *ids)
-            if self._settled.due < self.soonest:
-                self.soonest = self._settled.due
+            self.soonest = min(self.soonest, self._settled.due)
 
     def _give_up(self, id_: str, cause: str, text: str) -> None:
         if self.up:
@@ -380,19 +380,14 @@ class Caller:
 
     def _end_all(self, cause: str, text: str) -> None:
         for id_, pending in list(self._pending.items()):
-            if pending.sent:
-                self._end(id_, cause, text, m.Executed.UNKNOWN)
-            else:
-                self._end(id_, "unreachable" if cause == "lost" else cause, text, pending.if_unsent)
+            its = "unreachable" if cause == "lost" and not pending.sent else cause
+            self._end(id_, its, text, m.Executed.UNKNOWN if pending.sent else pending.if_unsent)
 
     def _end(self, id_: str, cause: str, text: str, executed: m.Executed) -> None:
         pending = self._pending.pop(id_)
         if pending.sent:
             self._settled.give_up(id_)
-        self._tell_end(pending, m.Outcome(id_, ERROR, {}, cause, text, executed))
-
-    def _tell_end(self, pending: Pending, outcome: m.Outcome) -> None:
-        waiter = pending.waiter
+        outcome, waiter = m.Outcome(id_, ERROR, {}, cause, text, executed), pending.waiter
         if waiter is None:
             self._notices.append(Ended(outcome))
         elif not waiter.done():

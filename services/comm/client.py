@@ -30,7 +30,7 @@ _NUMBERS = itertools.count(1)
 """Of calls: of all clients of this process, which may have one name and boot among them."""
 _OUTCOMES = frozenset((Outcome,))
 _NO_ARGUMENTS: Mapping[str, Any] = {}
-AT_ONCE = 16
+AT_ONCE = 32
 """Calls that share one write: the peer takes them in while the next ones are made."""
 
 
@@ -259,11 +259,12 @@ class Client:
 
     def took_outcomes(self, now: float, outcomes: list[Outcome]) -> None:
         """Calls have ended. Their owners go on in this turn of the loop: what they call now shares a write."""
-        self.caller.take_outcomes(now, outcomes)
-        if len(outcomes) > 1 and not self.caller.has_news:
-            self._flush_in_a_moment()
-        else:
+        caller = self.caller
+        caller.take_outcomes(now, outcomes)
+        if caller.has_news:
             self.flush(now)
+        elif len(outcomes) > 1 or caller.soonest < self._armed:
+            self._flush_in_a_moment()
 
     def welcomed(self, now: float, link: _ClientLink, welcome: Welcome) -> None:
         """A link was welcomed."""

@@ -267,8 +267,20 @@ def decode(body: bytes | memoryview) -> Message:
 
 def decode_kind(body: bytes | memoryview, kind: int) -> Message:
     """`decode` of a body whose kind and length have been checked."""
-    spec = _SPECS[kind]
+    reader = READERS.get(kind)
     size = len(body)
+    if reader is not None and size <= _UNCOUNTED:
+        try:
+            message = reader(_unpackb(body, ext_hook=_no_extension), size <= NAME_LENGTH)
+            if message is not None:
+                return message
+        except Exception:
+            pass  # whatever it is, the table finds and names it
+    return _decode_by_table(body, kind, size)
+
+
+def _decode_by_table(body: bytes | memoryview, kind: int, size: int) -> Message:
+    spec = _SPECS[kind]
     index = 2  # the map: all that a reader can find fault with
     try:
         try:
@@ -278,9 +290,6 @@ def decode_kind(body: bytes | memoryview, kind: int) -> Message:
                 fields = list(_unpack_counted(body, kind))
         except Exception as fault:
             raise _not_readable(fault) from None
-        reader = READERS.get(kind)
-        if reader is not None and (message := reader(fields, size <= NAME_LENGTH)) is not None:
-            return message
         del fields[0]
         if tuple(map(type, fields)) != spec.types:
             _other_types(spec, fields)

@@ -72,6 +72,15 @@ class UnderWay(dict[str, Pending]):
         self._accepts: deque[tuple[float, str]] = deque()
         self._results: list[tuple[float, str]] = []
 
+    def begin(self, pending: Pending) -> None:
+        """A call that was sent as it was made: it waits for ACCEPT."""
+        id_ = pending.call.id
+        self[id_] = pending
+        accepts = self._accepts
+        accepts.append((pending.accept_due, id_))
+        if len(accepts) > 2 * len(self) + _SPARE:
+            self._drop_past()
+
     def watch_accept(self, pending: Pending, due: float) -> None:
         """Wait for ACCEPT until `due`."""
         pending.accept_due = due
