@@ -109,6 +109,11 @@ class Dispatch:
         run = call.removeprefix(self._mission + "/")
         return run if run in self.flights else None
 
+    @property
+    def asked(self) -> bool:
+        """Whether a node still has to say whether it holds."""
+        return bool(self._commands)
+
     # --- orders ------------------------------------------------------------------------------------------------------
 
     def _start(self, now: float, start: StartRun, boot: str = "", known: bool = False) -> list[Stimulus]:

@@ -17,16 +17,15 @@ from coordinator.engine import Override, SetBreakpoints, Stimulus
 from coordinator.hmi.feed import Feed
 from coordinator.journal import JournalWriter
 from coordinator.launch import Setting, mission_id, realtime_mission, with_runs
-from coordinator.mission import MissionError
+from coordinator.mission import MissionError, Stage
 from coordinator.operation import Operation
 from coordinator.partners import FirstAlternative
 from coordinator.realtime import RealtimeMission, credentials_of
 from coordinator.recording import JournalStore, clock_reading
 from coordinator.runfolder import JOURNAL, RESULT, header
+from coordinator.start_order import StartOrder, learned_of
 from coordinator.task import Task
 from services.comm.directory import Directory
-
-SEED = 1
 
 
 class MissionRun:
@@ -37,18 +36,24 @@ class MissionRun:
         directory: Directory,
         task: Task,
         text: str,
-        parameters: Mapping[str, Any],
-        selector: FirstAlternative,
+        order: StartOrder,
         runs: Path,
         mock: Path | None = None,
     ) -> None:
-        """`text` is the task file's, `runs` the folder in which the run gets a folder of its own."""
+        """`text` is the task file's, `runs` the folder in which the run gets a folder of its own.
+
+        Raises EstimatesError and ValueError when it cannot learn as it is told to.
+        """
+        learn = order.learn
+        self._learning = None if learn is None else learn.session(task, directory, order.mode, order.seed)
+        selector = FirstAlternative() if self._learning is None else self._learning.selector
         self.identity = mission_id(task)
         self.folder = runs / self.identity
         self._selector = selector
-        setting = Setting(task, parameters, None, SEED, selector)
+        setting = Setting(task, order.parameters, order.runs, order.seed, selector)
         now = asyncio.get_running_loop().time()
-        self._store = _store(directory, setting, text, self.folder, self.identity, now, mock)
+        begun = {} if self._learning is None else {"learning": self._learning.beginning()}
+        self._store = _store(directory, setting, text, self.folder, self.identity, now, mock, begun)
         mission = realtime_mission(directory, setting, self.identity, self._store)
         self._shell = RealtimeMission(mission, directory, credentials_of(directory))
         self._operation: Operation | None = None
@@ -105,7 +110,9 @@ class MissionRun:
             await self._operation.close()
             await self._shell.close()
             self._store.writer.close()
-        result = self._shell.mission.result("realtime", time.perf_counter() - begun)
+            whole = self._shell.mission.stage is Stage.OVER
+            learned = {} if self._learning is None else learned_of(self._learning, interrupted=not whole)
+        result = {**self._shell.mission.result("realtime", time.perf_counter() - begun), **learned}
         text = json.dumps(result, indent=2, ensure_ascii=False) + "\n"
         await asyncio.to_thread((self.folder / RESULT).write_text, text, encoding="utf-8")
         feed.emit("result", result=result)
@@ -115,23 +122,15 @@ class MissionRun:
         self._shell.mission.start(now)
 
 
-def given_parameters(task: Task, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Parameters that a client gave, in the task's own types. Raises ValueError that names what does not fit."""
-    made = {}
-    for name, value in given.items():
-        if name not in task.parameters:
-            raise ValueError(f"{task.name} has no parameter {name!r}; it has: {', '.join(task.parameters) or 'none'}")
-        kind = type(task.parameters[name])
-        if kind is float and type(value) is int:
-            value = float(value)
-        if type(value) is not kind:
-            raise ValueError(f"parameter {name}: {value!r} is no {kind.__name__}")
-        made[name] = value
-    return made
-
-
 def _store(
-    directory: Directory, setting: Setting, text: str, folder: Path, mission: str, origin: float, mock: Path | None
+    directory: Directory,
+    setting: Setting,
+    text: str,
+    folder: Path,
+    mission: str,
+    origin: float,
+    mock: Path | None,
+    begun: Mapping[str, Any],
 ) -> JournalStore:
     given: dict[str, Any] = {
         "services_path": str(directory.source.resolve()),
@@ -142,6 +141,7 @@ def _store(
         "durable": False,
         "mock": str(mock.resolve()) if mock else "",
         "chosen": {},
+        **begun,
     }
     services = directory.source.read_text(encoding="utf-8")
     return JournalStore(JournalWriter(folder / JOURNAL, header(mission, text, services, "realtime", given)), origin)

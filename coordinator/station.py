@@ -21,9 +21,11 @@ from coordinator.hmi import verdicts
 from coordinator.hmi.feed import Feed
 from coordinator.hmi.narrator import Narrator
 from coordinator.hmi.store import StoreError, TaskStore, TaskText
-from coordinator.mission_run import MissionRun, given_parameters
 from coordinator.partners import FirstAlternative
 from coordinator.realtime import UnreachableError, credentials_of
+from coordinator.simulated_run import SimulatedRun
+from coordinator.start_order import LOCKSTEP, StartOrder, read_start, start_form
+from coordinator.starting import FAULTS, Starting
 from coordinator.task import Task
 from coordinator.taskfile import TaskFileError, loads
 from coordinator.watching import shown_selectors
@@ -54,20 +56,26 @@ class Run(Protocol):
 class Station:
     """One cell's coordinator; `runs` is where journals are kept, `door` gives the address that each run leaves in its folder."""
 
-    def __init__(self, directory: Directory, tasks: TaskStore, runs: Path, mock: Path | None = None) -> None:
+    def __init__(
+        self,
+        directory: Directory,
+        tasks: TaskStore,
+        runs: Path,
+        mock: Path | None = None,
+        estimates: Path = Path("estimates"),
+    ) -> None:
         self.directory = directory
         self.feed = Feed()
         self.controls = Controls(self.feed)
         self.door: Callable[[str], Door] | None = None
         self._tasks = tasks
-        self._runs = runs
-        self._mock = mock
+        self._starting_by = Starting(directory, runs, mock, estimates)
         self._loaded = ""
         self._stops: set[str] = set()
         self._choices: dict[str, str] = {}
         self._nodes: Mapping[str, Any] = {}
         self._run: Run | None = None
-        self._starting = False
+        self._starting = self._stopped = False
         self._going: asyncio.Task[None] | None = None
         self._looking = asyncio.get_running_loop().create_task(self._look())
         self.feed.replace(mission={"id": "", "state": "idle", "mode": "realtime", "starts": True, "file": ""})
@@ -100,8 +108,13 @@ class Station:
         answer = self.controls.fault(who, verb) or self.controls.carry_out(who, verb, data)
         if answer is not None:
             return answer
+        if verb in ("estop", "clear_estop"):
+            self._stopped = verb == "estop"
         if verb in ("start", "load"):
             return await self._guarded(self._start if verb == "start" else self._load, verb, who, data)
+        if verb == "estop" and isinstance(self._run, SimulatedRun):
+            await self._run.command(who, verb, data)
+            return await self._estop(who, data)  # whoever presses it means the real devices, too
         if self._run is not None:
             return await self._run.command(who, verb, data)
         idle: dict[str, Callable[[str, Mapping[str, Any]], Awaitable[Answer]]] = {
@@ -125,10 +138,17 @@ class Station:
             return await carry_out(who, data)
         except (KeyError, TypeError, ValueError) as fault:
             return refusal("bad_data", f"{verb}: {fault}")
+        except FAULTS as fault:
+            return refusal("bad_data", f"{verb}: {fault}")
 
     def offers(self) -> Sequence[Mapping[str, Any]]:
         """Every action that services.toml places, and whether its node is up and says that it offers it."""
         return offered(self.directory, lambda action, node: action in self._nodes.get(node, {}).get("offers", ()))
+
+    def form(self, name: str) -> Mapping[str, Any]:
+        """What may be asked for when a task is started. Raises StoreError, TaskFileError."""
+        text = self._tasks.read(name)
+        return start_form(loads(text.text, f"{name}.toml"), text.text, self._starting_by.estimates)
 
     # --- a task, and a run of it -----------------------------------------------------------------------------------
 
@@ -151,6 +171,8 @@ class Station:
             await asyncio.wait({self._going}, timeout=LAST_WORDS)  # it only hangs up yet
         if self._busy:
             return self._busy_answer()
+        if self._stopped:
+            return refusal("stopped", "the emergency stop stands; clear it first")
         self._starting = True  # nobody else may come in between
         try:
             return await self._started(who, data)
@@ -166,6 +188,8 @@ class Station:
         return refusal("running", f"{mission['id'] or 'a mission run'} goes on; abort it, or wait for its end")
 
     async def _started(self, who: str, data: Mapping[str, Any]) -> Answer:
+        if data.get("from") is not None:
+            return await self._departed(data)
         name = str(data.get("task") or self._loaded)
         if not name:
             return refusal("task", "choose a task first")
@@ -178,10 +202,22 @@ class Station:
             return faulty
         if name != self._loaded:
             self._forget(name)
-        if data.get("mode", "realtime") != "realtime":
-            return refusal("mode", f"no runs of mode {data['mode']!r} here")
-        parameters = given_parameters(task, data.get("parameters") or {})
-        return await self._live(task, text.text, parameters)
+        order = read_start(task, data, self._starting_by.estimates)
+        if order.mode == LOCKSTEP:
+            return self._simulated(await asyncio.to_thread(self._starting_by.simulated, task, text.text, order))
+        return await self._live(task, text.text, order)
+
+    async def _departed(self, data: Mapping[str, Any]) -> Answer:
+        """A simulated run from a point of a recorded one."""
+        task, run = await asyncio.to_thread(self._starting_by.departed, data)
+        self._forget(task.name)
+        return self._simulated(run)
+
+    def _simulated(self, run: SimulatedRun) -> Answer:
+        run.lead(self.feed, self.controls, self.door, self._stops, self._choices)
+        self.feed.emit("mission", mission={"file": self._loaded})
+        self._follow(run)
+        return {"ok": True, "run": run.identity}
 
     async def _faults(self, text: TaskText) -> Answer | None:
         """Why a task may not run: what the check finds."""
@@ -194,9 +230,8 @@ class Station:
         more = f"; and {len(faults) - FAULTS_TOLD} more" if len(faults) > FAULTS_TOLD else ""
         return {**refusal("faults", f"{text.name} may not run: {told}{more}"), "findings": faults}
 
-    async def _live(self, task: Task, text: str, parameters: Mapping[str, Any]) -> Answer:
-        selector = FirstAlternative()
-        run = MissionRun(self.directory, task, text, parameters, selector, self._runs, self._mock)
+    async def _live(self, task: Task, text: str, order: StartOrder) -> Answer:
+        run = self._starting_by.live(task, text, order)
         try:
             await run.connect()
         except UnreachableError as fault:

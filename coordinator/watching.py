@@ -9,12 +9,12 @@ import asyncio
 from base64 import b64encode
 from collections.abc import Callable, Mapping
 from math import isfinite
-from typing import Any
+from typing import Any, Protocol
 
 from coordinator.engine import Instruction, RunRecorded, State, Stimulus
 from coordinator.hmi.feed import Feed
+from coordinator.mission import Mission
 from coordinator.partners import FirstAlternative
-from coordinator.realtime import RealtimeMission
 from coordinator.task import Task
 from services.comm.messages import Command
 from services.comm.notice import Progress
@@ -25,7 +25,8 @@ PATIENCE = 2.0
 """Seconds after which a question that was not answered is asked again."""
 CURVE_KEPT = 500
 """Trials that a learning curve shows."""
-SHOWN_IN_CURVE = "probability"
+IN_CURVES = {"probability": "probability", "j": "J"}
+"""Figures of the alternatives that have a curve, and how they are called on it."""
 
 
 def shown_selectors(task: Task, selector: FirstAlternative) -> dict[str, Any]:
@@ -42,13 +43,25 @@ def shown_alternatives(task: Task, selector: FirstAlternative, name: str) -> lis
     return [{"action": a, **figures.get(a, {})} for a in task.primitive_tasks[name].alternatives]
 
 
+class Watched(Protocol):
+    """What drives a mission run: its clock, and the way to the nodes."""
+
+    mission: Mission
+
+    def now(self) -> float:
+        """The mission's clock (s)."""
+
+    def flush(self, node: str) -> None:
+        """Send what was said to a node."""
+
+
 class Watching:
     """Asks the nodes and observes the executor for one mission run; `watched` says whether anybody looks."""
 
     def __init__(
-        self, shell: RealtimeMission, feed: Feed, selector: FirstAlternative, origin: float, watched: Callable[[], bool]
+        self, shell: Watched, feed: Feed, selector: FirstAlternative, origin: float, watched: Callable[[], bool]
     ) -> None:
-        """`origin` is the loop's time at which the mission's clock was 0 (s)."""
+        """`origin` is the shell's time at which the mission's clock was 0 (s)."""
         self._shell = shell
         self._mission = shell.mission
         self._directory = shell.mission.executor.directory
@@ -73,10 +86,10 @@ class Watching:
     def ask(self, node: str, verb: str) -> None:
         """Send a node an operator's command that is no stimulus: nothing waits for its answer."""
         self._numbers += 1
-        now = asyncio.get_running_loop().time()
+        now = self._shell.now()
         id_ = f"{self._mission.executor.mission}/operator/{verb}#{self._numbers}"
         self._mission.callers[node].command(now, Command(id_, verb))
-        self._shell.clients[node].flush(now)
+        self._shell.flush(node)
 
     async def _poll(self) -> None:
         owners = {device.node for device in self._directory.devices.values() if device.driver}
@@ -136,7 +149,7 @@ class Watching:
         """How old the newest set point of the device's stream is, while one is followed."""
         if not isinstance(age, float) or not isfinite(age):
             return
-        now = asyncio.get_running_loop().time() - self._origin
+        now = self._shell.now() - self._origin
         for stream in self._directory.streams.values():
             if stream.to == device and age <= 10 * stream.period:
                 self._feed.emit("setpoint", stream=stream.name, samples=[[round(now, 3), round(age, 6)]])
@@ -156,27 +169,22 @@ class Watching:
         known = self._feed.state["selectors"].get(name, {})
         self._feed.emit("selector", name=name, selector={**known, "alternatives": shown})
         if len(shown) > 1:
-            self._curve(name, {a["action"]: a[SHOWN_IN_CURVE] for a in shown if SHOWN_IN_CURVE in a})
+            for figure, word in IN_CURVES.items():
+                self._curve(name, figure, word, {a["action"]: a[figure] for a in shown if figure in a})
 
-    def _curve(self, name: str, values: dict[str, float]) -> None:
-        """One more trial of a primitive task on its curve."""
-        rows = [*self._curves.get(name, []), values]
-        trial = len(rows) if len(rows) <= CURVE_KEPT else self._feed.state["reports"][name]["columns"][0][-1] + 1
+    def _curve(self, name: str, figure: str, word: str, values: dict[str, float]) -> None:
+        """One more trial of a primitive task on one of its curves."""
+        key = name if word == "probability" else f"{name}: {word}"
+        rows = [*self._curves.get(key, []), values]
+        trial = len(rows) if len(rows) <= CURVE_KEPT else self._feed.state["reports"][key]["columns"][0][-1] + 1
         rows = rows[-CURVE_KEPT:]
-        self._curves[name] = rows
+        self._curves[key] = rows
         series = sorted({action for row in rows for action in row})
         trials = list(range(trial - len(rows) + 1, trial + 1))
         columns = [trials, *([row.get(action) for row in rows] for action in series)]
-        title = f"{name}: probability of each alternative"
-        report = {
-            "kind": "curve",
-            "title": title,
-            "x": "trial",
-            "y": "probability",
-            "series": series,
-            "columns": columns,
-        }
-        self._feed.emit("report", name=name, report=report)
+        title = f"{name}: {word} of each alternative"
+        report = {"kind": "curve", "title": title, "x": "trial", "y": word, "series": series, "columns": columns}
+        self._feed.emit("report", name=key, report=report)
 
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
         """Nothing to show that the narrator does not tell."""

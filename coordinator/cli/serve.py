@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 EXAMPLE = "petrobot serve --up"
 OWN_TASKS = Path("tasks")
+ESTIMATES = Path("estimates")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,6 +39,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--mock", metavar="FILE", type=Path, help="with --up: replace actions by scripted ones")
     parser.add_argument(
         "--page-port", type=int, default=0, metavar="PORT", help="the page's port (default: a free one)"
+    )
+    parser.add_argument(
+        "--estimates",
+        metavar="FOLDER",
+        type=Path,
+        default=ESTIMATES,
+        help="where runs that learn keep what they learned, one file a name (%(default)s)",
     )
     parser.add_argument("--journal", metavar="FOLDER", type=Path, help="where runs are kept (default: runs)")
 
@@ -63,7 +71,7 @@ async def _serve(directory: Directory, options: argparse.Namespace) -> int:
     runs = options.journal or DEFAULT
     try:
         async with _nodes(directory, runs, options):
-            station = Station(directory, TaskStore(options.tasks, SHIPPED), runs, options.mock)
+            station = Station(directory, TaskStore(options.tasks, SHIPPED), runs, options.mock, options.estimates)
             try:
                 await station.look()
                 await _page(station, runs, options, stop)
@@ -87,6 +95,7 @@ async def _page(station: Station, runs: Path, options: argparse.Namespace, stop:
             port=options.page_port,
             offers=station.offers,
             history=JournalHistory(runs),
+            starts=station.form,
         )
     except OSError as fault:
         raise CommandError(2, f"port {options.page_port}: {fault.strerror}; choose another with --page-port") from fault

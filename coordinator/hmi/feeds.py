@@ -8,6 +8,8 @@ from coordinator.hmi.house import HOUSE
 from coordinator.hmi.port import PROTOCOL
 from coordinator.hmi.requests import json_answer, read_object
 from coordinator.hmi.sessions import LARGEST_MESSAGE, Session, carry_out, who_is
+from coordinator.hmi.store import StoreError
+from coordinator.taskfile import TaskFileError
 
 CLIENTS = 64
 
@@ -17,6 +19,7 @@ def add_routes(app: web.Application) -> None:
     app.router.add_get("/api/live", _live)
     app.router.add_get("/api/snapshot", _snapshot)
     app.router.add_post("/api/command", _command)
+    app.router.add_get("/api/start/{name}", _start)
 
 
 async def _live(request: web.Request) -> web.StreamResponse:
@@ -39,6 +42,19 @@ async def _live(request: web.Request) -> web.StreamResponse:
 async def _snapshot(request: web.Request) -> web.Response:
     snapshot = request.app[HOUSE].port.snapshot()
     return json_answer({**snapshot, "type": "snapshot", "protocol": PROTOCOL})
+
+
+async def _start(request: web.Request) -> web.Response:
+    """What may be asked for when this task is started, with types and defaults."""
+    starts = request.app[HOUSE].starts
+    if starts is None:
+        raise web.HTTPNotFound(text="no run can be started here")
+    try:
+        return json_answer(starts(request.match_info["name"]))
+    except StoreError as fault:
+        raise (web.HTTPNotFound if fault.status == 404 else web.HTTPBadRequest)(text=str(fault)) from fault
+    except TaskFileError as fault:
+        raise web.HTTPUnprocessableEntity(text=str(fault)) from fault
 
 
 async def _command(request: web.Request) -> web.Response:

@@ -12,7 +12,7 @@ from aiohttp import web
 
 from coordinator.hmi.doors import Doors
 from coordinator.hmi.gate import Gate
-from coordinator.hmi.port import HistoryPort, MissionPort, OffersPort
+from coordinator.hmi.port import HistoryPort, MissionPort, OffersPort, StartsPort
 from coordinator.hmi.sessions import Session, carry_out, encode
 from coordinator.hmi.store import TaskStore
 
@@ -32,6 +32,7 @@ class House:
     doors: Doors
     offers: OffersPort | None = None
     history: HistoryPort | None = None
+    starts: StartsPort | None = None
     gate: Gate | None = None
     sessions: set[Session] = field(default_factory=set)
     commands: set[asyncio.Task[None]] = field(default_factory=set)

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from coordinator.engine import Engine, Fired, Report, RunRecorded, StartRun
+from coordinator.engine import Engine, Fired, Phase, Report, RunRecorded, StartRun
 from coordinator.hmi.picture import picture
 from coordinator.hmi.telling import reason_of, told
 from coordinator.journal import Journal, JournalError, read_journal
@@ -81,10 +81,17 @@ def opened(path: Path, run: str) -> dict[str, Any]:
         "mode": header.get("mode", ""),
         "seed": header.get("seed"),
         "started": header.get("date", ""),
+        "from": _source(header),
         "task": picture(task),
         "initial": dict(zip(task.net.places, task.net.initial, strict=True)),
         "records": records,
     }
+
+
+def _source(header: Mapping[str, Any]) -> dict[str, Any] | None:
+    """From which point of which run this one set out."""
+    source = header.get("from")
+    return {key: source[key] for key in ("run", "record", "going") if key in source} if source else None
 
 
 def task_of(journal: Journal) -> Task:
@@ -117,7 +124,7 @@ class _Teller:
         self._errors = {t.name for t in task.flat.transitions.values() if any(i.end is End.ERROR for i in t.inputs)}
 
     def record(self, step: Step) -> dict[str, Any]:
-        """{number, t, text, firings, marking (what changed), runs, error}."""
+        """{number, t, text, firings, marking (what changed), notes, error, going (places whose runs go on)}."""
         firings, notes = [], []
         for instruction in step.instructions:
             if isinstance(instruction, StartRun):
@@ -141,6 +148,7 @@ class _Teller:
             "marking": changed,
             "notes": notes,
             "error": any(f["error"] for f in firings),
+            "going": sorted({run.place for run in step.state.runs() if run.phase is not Phase.DONE}),
         }
 
     def _firing(self, step: Step, fired: Fired) -> dict[str, Any]:

@@ -62,6 +62,14 @@ class HistoryPort(Protocol):
         """One run: {id, task (as in a snapshot), initial (marking), records: [record, ...]}. Raises KeyError."""
 
 
+class StartsPort(Protocol):
+    """What may be asked for when a task is started."""
+
+    def __call__(self, name: str, /) -> Mapping[str, Any]:
+        """{task, runs ({default, place} or None), seed, modes, parameters: [{name, type, default, text}], learn: {selectors,
+        selector, contexts, estimates}} of a task file. Raises StoreError, TaskFileError."""
+
+
 class OffersPort(Protocol):
     """What the nodes offer now, for the designer."""
 

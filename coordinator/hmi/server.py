@@ -15,7 +15,7 @@ from coordinator.hmi import documents, feeds
 from coordinator.hmi.doors import Doors, Handler, middleware, names_for
 from coordinator.hmi.gate import Gate
 from coordinator.hmi.house import HOUSE, House
-from coordinator.hmi.port import HistoryPort, MissionPort, OffersPort
+from coordinator.hmi.port import HistoryPort, MissionPort, OffersPort, StartsPort
 from coordinator.hmi.requests import LARGEST_BODY
 from coordinator.hmi.sessions import Session
 from coordinator.hmi.store import TaskStore
@@ -72,6 +72,7 @@ async def start_page(
     token: str | None = None,
     offers: OffersPort | None = None,
     history: HistoryPort | None = None,
+    starts: StartsPort | None = None,
     names: Sequence[str] = (),
     tls: ssl.SSLContext | None = None,
     page: bool = True,
@@ -85,7 +86,7 @@ async def start_page(
     listener = _listen(host, port)
     number = listener.getsockname()[1]
     doors = Doors(token or secrets.token_urlsafe(24), number, names_for(host, names), tls is not None)
-    house = House(port_object, TaskStore(tasks_folder, shipped), doors, offers, history)
+    house = House(port_object, TaskStore(tasks_folder, shipped), doors, offers, history, starts)
     runner = web.AppRunner(_application(house, page), access_log=None, keepalive_timeout=30.0, shutdown_timeout=1.0)
     await runner.setup()
     assert runner.server is not None

@@ -439,10 +439,13 @@ async def test_history(browser: Browser, page: Page, stage: Stage, shots: Path, 
     await scrub.get_by_role("button", name="Previous error").click()
     await tab.screenshot(path=shots / "history.png")
     await scrub.get_by_role("button", name="Simulate from here").click()
+    dialog = tab.get_by_role("dialog", name="Simulate from here")
+    await dialog.get_by_label("Run in clear").select_option("error")
+    await dialog.get_by_role("button", name="Simulate").click()
     await expect(tab.get_by_role("tab", name="Live")).to_have_attribute("aria-selected", "true")
     _, verb, data = stage.commands[-1]
-    assert (verb, data["mode"], data["from"]["run"]) == ("start", "simulated", "pick_and_place-2")
-    assert data["marking"]["clear"] == 1
+    assert (verb, data["mode"], data["from"]["run"]) == ("start", "lockstep", "pick_and_place-2")
+    assert data["from"]["going"] == {"clear": "error"} and data["from"]["record"] > 0
     assert complaints == []
 
 

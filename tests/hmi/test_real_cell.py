@@ -196,7 +196,7 @@ async def start_again(tab: Tab, shots: Path) -> None:
     await expect(toolbar.get_by_label("Task to start").locator("option", has_text="(shipped)").first).to_be_attached()
     await toolbar.get_by_label("Task to start").select_option("")
     await toolbar.get_by_label("Task to start").select_option("drawn")
-    await expect(mission).to_contain_text("Ready")
+    await expect(mission).to_contain_text("Idle")
     await element(tab, "^Transition begin", "Task net").click()
     await tab.get_by_role("button", name="Set breakpoint").click()
     await toolbar.get_by_role("button", name="Start").click()

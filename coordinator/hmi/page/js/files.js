@@ -28,6 +28,7 @@ export const openTask = (name) => need("GET", `/api/tasks/${encodeURIComponent(n
 export const loadOffers = async () => (await need("GET", "/api/offers")) ?? [];
 export const listRuns = async () => (await need("GET", "/api/runs")) ?? [];
 export const openRun = (run) => need("GET", `/api/runs/${encodeURIComponent(run)}`);
+export const startForm = (name) => need("GET", `/api/start/${encodeURIComponent(name)}`);
 export const importNet = (form, text) => need("POST", "/api/import", { form, text });
 
 /** What the check says of a document; null when the server cannot tell. */

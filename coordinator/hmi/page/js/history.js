@@ -5,6 +5,7 @@ import { attribute, fill, h, seconds, text, words } from "./dom.js";
 import { listRuns, openRun } from "./files.js";
 import { icon } from "./icons.js";
 import { reasonText } from "./live.js";
+import { departDialog } from "./start.js";
 import { alarmed, sheetOf, tokensOf, trailOf } from "./sheet.js";
 
 const SESSION = "(this run)";
@@ -133,9 +134,12 @@ export class History {
 
   controlsChanged() {
     const { mission } = this.link.state;
-    this.startHere.hidden = mission.starts === false || mission.file !== undefined; // a real cell cannot begin in the middle
-    this.startHere.disabled = !this.link.mayAct || !this.reel?.run.task;
-    attribute(this.startHere, "title", this.link.mayAct ? null : "Take the controls first");
+    const seen = this.reel?.run.id === SESSION;
+    const live = ["running", "paused", "stopping", "preparing"].includes(mission.state);
+    const why = !this.link.mayAct ? "Take the controls first, under Live" : seen ? "Open the recorded run in the list" : live ? "A run goes on; wait for its end" : "";
+    this.startHere.hidden = mission.starts === false;
+    this.startHere.disabled = Boolean(why) || !this.reel?.run.task;
+    attribute(this.startHere, "title", why || null);
   }
 
   // ---- the run that goes on, as this page has seen it ----------------------------------------------------------------
@@ -223,7 +227,8 @@ export class History {
 
   paintAbout() {
     const { run } = this.reel;
-    const facts = [`${run.records.length} records`, `${this.reel.firings.length} firings`, run.seed !== undefined && run.seed !== null ? `seed ${run.seed}` : "", run.mode].filter(Boolean).join(", ");
+    const from = run.from ? `from ${run.from.run}, ${run.from.record ? `record ${run.from.record}` : "beginning"}` : "";
+    const facts = [`${run.records.length} records`, `${this.reel.firings.length} firings`, run.seed !== undefined && run.seed !== null ? `seed ${run.seed}` : "", run.mode, from].filter(Boolean).join(", ");
     if (!this.other) return fill(this.about, run.fault ? h("span", {}, icon("warning"), ` ${run.fault}. `) : null, facts);
     const first = this.firstDifference();
     if (!first) return fill(this.about, "Both runs fired the same transitions in the same order.");
@@ -278,7 +283,7 @@ export class History {
     let current = null;
     fill(this.rowsBox, listed.slice(from, from + 2 * ROWS_AROUND).map(([record, at]) => {
       const row = h("li", {}, h("button", { type: "button", class: `record${record.error ? " error" : ""}${at > this.index ? " future" : ""}`, "aria-current": at === this.index ? "true" : null, onclick: () => this.go(at, false) },
-        h("span", { class: "line" }, h("strong", {}, record.firings.length ? record.firings.map((f) => this.labelOf(f.transition)).join(", ") : words(record.text)), h("span", { class: "number muted" }, seconds(record.t))),
+        h("span", { class: "line" }, h(record.firings.length ? "strong" : "span", {}, record.firings.length ? record.firings.map((f) => this.labelOf(f.transition)).join(", ") : words(record.text)), h("span", { class: "number muted" }, seconds(record.t))),
         record.firings.length ? h("span", { class: "detail" }, words(record.text)) : null,
         record.firings.map(reasonText).filter(Boolean).map((r) => h("span", { class: "detail reason" }, r)),
         (record.notes ?? []).map((note) => h("span", { class: "detail" }, words(note)))));
@@ -291,9 +296,14 @@ export class History {
     if (top < box.scrollTop + 40 || top + tall > box.scrollTop + box.clientHeight - 40) box.scrollTop = top - box.clientHeight / 2;
   }
 
-  async simulate() {
-    const { run } = this.reel;
-    const answer = await this.operator.give("start", { task: run.task.name, mode: "simulated", marking: this.reel.marking(this.index), from: { run: run.id, record: this.index } });
-    if (answer.ok) location.hash = "#Live";
+  simulate() {
+    const { run, records } = this.reel;
+    const record = this.index ? records[this.index - 1] : null;
+    const labelOf = (place) => words(run.task.places.find((p) => p.name === place)?.label || place);
+    departDialog(run, record?.number ?? 0, record?.going ?? [], labelOf, async (data) => {
+      const answer = await this.operator.give("start", data, false, true);
+      if (answer.ok) location.hash = "#Live";
+      return answer;
+    });
   }
 }

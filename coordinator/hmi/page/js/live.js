@@ -6,6 +6,7 @@ import { Chart } from "./charts.js";
 import { attribute, fill, h, rows, seconds, text, words } from "./dom.js";
 import { icon } from "./icons.js";
 import { stateOf } from "./operator.js";
+import { Learning, objectives } from "./learning.js";
 import { Selected } from "./selected.js";
 import { alarmed, sheetOf, tokensOf, trailOf } from "./sheet.js";
 import { Timeline } from "./timeline.js";
@@ -29,7 +30,7 @@ export class Live {
     this.selectors = panel("Selectors", h("ul", { class: "selectors" }));
     this.result = h("section", { class: "result", role: "status", hidden: true });
     this.side = h("aside", { class: "side", "aria-label": "Mission details" }, this.result, this.selected.root, this.running.root, this.firings.root, this.selectors.root, this.nodes.root);
-    this.dock = new Dock(link, (place) => this.canvas.goTo(place));
+    this.dock = new Dock(link, (place) => this.canvas.goTo(place), () => this.paintHeat());
     this.notice = h("p", { class: "empty-net" }, "No task is loaded.");
     this.canvas.root.append(this.notice);
     this.root = h("div", { class: "live" }, h("div", { class: "stage" }, this.canvas.root, this.dock.root), this.side);
@@ -56,6 +57,8 @@ export class Live {
   draw() {
     const { task } = this.link.state;
     this.notice.hidden = Boolean(task);
+    this.canvas.corner.hidden = !task;
+    if (!task) this.canvas.errors.hidden = true;
     text(this.notice, this.link.state.mission.file === undefined ? "No task is loaded." : "Choose a task above, or draw one under Design.");
     if (!task) return;
     if (this.inside && !task.places.some((p) => p.name === this.inside)) this.inside = "";
@@ -65,6 +68,7 @@ export class Live {
     this.paintTokens();
     this.paintRuns();
     this.paintMarks();
+    this.paintHeat();
   }
 
   /** Called at most once a frame with what has changed. */
@@ -98,6 +102,7 @@ export class Live {
     if (dirty("firings")) this.paintFirings(changed.has("all"));
     if (dirty("nodes")) this.paintNodes();
     if (dirty("selectors")) this.paintSelectors();
+    if (dirty("selectors")) this.paintHeat();
     if (dirty("result", "mission")) this.paintResult();
     if (dirty("marking", "runs", "breakpoints", "events", "controls", "firings", "connection")) this.selected.update(this.link.state, this.link.now());
     this.dock.paint(changed);
@@ -232,6 +237,20 @@ export class Live {
     else delete this.nodes.content.dataset.empty;
   }
 
+  /** The places coloured by the J of their primitive task, while that is switched on. */
+  paintHeat() {
+    const { task, selectors } = this.link.state;
+    const shares = this.dock.learning.hot ? objectives(selectors) : {};
+    const primitive = new Map((task?.places ?? []).map((p) => [p.name, p.primitive_task]));
+    for (const element of this.view.elements.values()) {
+      if (element.kind !== "action") continue;
+      const share = shares[primitive.get(element.name)];
+      element.node.classList.toggle("hot", share !== undefined);
+      element.node.style.setProperty("--heat", `${Math.round(70 * Math.max(0, Math.min(1, share ?? 0)))}%`);
+    }
+    this.dock.learning.update(this.link.state);
+  }
+
   paintSelectors() {
     const list = Object.entries(this.link.state.selectors).filter(([, sel]) => (sel.alternatives ?? []).length > 1);
     this.selectors.root.hidden = !list.length;
@@ -279,17 +298,16 @@ export function reasonText(firing) {
 
 /** The lower part: timeline, set points, images, devices, learning, variables. */
 class Dock {
-  constructor(link, chosen) {
+  constructor(link, chosen, heated) {
     this.link = link;
     this.timeline = new Timeline(chosen);
     this.latency = new Chart("Age of the newest set point when it was used", "mission time (s)", "age (ms)");
     this.cameras = new Cameras();
     this.devices = new Devices();
-    this.learning = h("div", { class: "learning" });
-    this.charts = new Map();
+    this.learning = new Learning(heated);
     this.table = h("div", { class: "variables" });
     this.events = h("div", { class: "variables" });
-    const pages = { Timeline: this.timeline.root, "Set points": this.latency.root, Camera: this.cameras.root, Devices: this.devices.root, Learning: this.learning, Variables: this.table, Events: this.events };
+    const pages = { Timeline: this.timeline.root, "Set points": this.latency.root, Camera: this.cameras.root, Devices: this.devices.root, Learning: this.learning.root, Variables: this.table, Events: this.events };
     this.pages = pages;
     this.tabs = h("div", { class: "tabs", role: "tablist", "aria-label": "Details" }, Object.keys(pages).map((name) =>
       h("button", { type: "button", role: "tab", id: `tab-${name.replace(" ", "-")}`, onclick: () => this.show(name), onkeydown: (e) => this.move(e) }, name)));
@@ -326,7 +344,7 @@ class Dock {
     if (this.shown === "Set points" && dirty("setpoints")) this.paintLatency(state.setpoints);
     if (this.shown === "Camera" && dirty("images")) this.cameras.update(state.images);
     if (this.shown === "Devices" && dirty("devices")) this.devices.update(state.devices);
-    if (this.shown === "Learning" && dirty("reports")) this.paintLearning(state.reports);
+    if (this.shown === "Learning" && (dirty("reports") || dirty("selectors"))) this.learning.update(state);
     if (this.shown === "Variables" && dirty("variables")) this.paintTable(this.table, state.variables, "No variable is known.");
     if (this.shown === "Events" && dirty("events")) this.paintEvents(state);
   }
@@ -349,22 +367,6 @@ class Dock {
       return times.map((t) => (by.has(t) ? by.get(t) * 1000 : null));
     });
     this.latency.set(streams.length ? streams : ["no stream yet"], streams.length ? [times, ...columns] : [[0, 1], [null, null]]);
-  }
-
-  paintLearning(reports) {
-    const curves = Object.entries(reports).filter(([, r]) => r.kind === "curve");
-    const others = Object.entries(reports).filter(([, r]) => r.kind !== "curve");
-    for (const [name, report] of curves) {
-      if (!this.charts.has(name)) {
-        const chart = new Chart(report.title ?? words(name), report.x ?? "runs", report.y ?? "");
-        this.charts.set(name, chart);
-        this.learning.append(chart.root);
-      }
-      this.charts.get(name).set(report.series, report.columns);
-    }
-    if (!this.notes) this.learning.append((this.notes = h("div", { class: "notes" })));
-    fill(this.notes, others.map(([name, r]) => h("article", {}, h("h3", {}, r.title ?? words(name)), h("p", {}, r.text ?? ""))),
-      curves.length || others.length ? null : h("p", { class: "empty" }, "Nothing has been learned yet. Curves appear here when a run learns."));
   }
 
   paintTable(host, values, empty) {

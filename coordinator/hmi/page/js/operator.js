@@ -1,8 +1,9 @@
 // The operator's controls: mission commands, who holds the controls, and the emergency stop that is always there.
 
 import { attribute, fill, h, seconds, text, words } from "./dom.js";
-import { listTasks } from "./files.js";
+import { listTasks, startForm } from "./files.js";
 import { icon } from "./icons.js";
+import { clearDialog, startDialog } from "./start.js";
 import { toast } from "./toast.js";
 
 export const ESTOP_KEY = "F9";
@@ -14,7 +15,7 @@ const DONE = {
   load: "Task loaded", clear_estop: "Emergency stop cleared", override_selector: "Selector set", breakpoint: "Breakpoint set",
 };
 const STATE_WORD = {
-  idle: "Ready", preparing: "Preparing", running: "Running", stopping: "Stopping", paused: "Paused", success: "Success",
+  idle: "Idle", preparing: "Preparing", running: "Running", stopping: "Stopping", paused: "Paused", success: "Success",
   failure: "Failure", error: "Error", aborted: "Aborted", stopped: "Emergency stop",
 };
 const PAUSE_WORD = { operator: "Paused by the operator", step: "Paused after one firing" };
@@ -38,11 +39,12 @@ export class Operator {
       resume: button("resume", "resume", "Resume"),
       abort: button("abort", "abort", "Abort", { class: "command danger", onclick: () => this.confirm(this.buttons.abort, "abort", "Abort the mission?") }),
     };
-    this.clear = button("clear_estop", "check", "Clear the stop", { hidden: true });
+    this.clear = button("clear_estop", "check", "Clear the stop", { hidden: true, onclick: () => this.clearStop() });
+    this.options = h("button", { type: "button", class: "command", hidden: true, "aria-haspopup": "dialog", onclick: () => this.startWith() }, icon("more"), h("span", {}, "Start with"));
     this.picker = h("select", { class: "pick-task", "aria-label": "Task to start", onchange: () => this.load(), onfocus: () => this.listTasks() });
     this.controls = h("div", { class: "holder" });
     this.answer = h("p", { class: "pause-note", role: "status" });
-    this.bar = h("div", { class: "operator", role: "toolbar", "aria-label": "Mission" }, this.picker, Object.values(this.buttons), this.clear, this.answer, this.controls);
+    this.bar = h("div", { class: "operator", role: "toolbar", "aria-label": "Mission" }, this.picker, this.buttons.start, this.options, Object.values(this.buttons).slice(1), this.clear, this.answer, this.controls);
     this.estop = h("button", { type: "button", class: "estop", "aria-keyshortcuts": ESTOP_KEY, onclick: () => this.stopNow() },
       icon("stop"), h("span", {}, "Emergency stop"), h("kbd", {}, ESTOP_KEY));
     addEventListener("keydown", (event) => {
@@ -53,8 +55,9 @@ export class Operator {
   }
 
   /** Give a command and tell how it was answered. */
-  async give(verb, data, silent = false) {
+  async give(verb, data, silent = false, shown = false) {
     const answer = await this.link.command(verb, data);
+    if (!answer.ok && shown) return answer; // the dialog that asked shows why
     if (!answer.ok) toast("error", `${words(verb)}: ${answer.text ?? answer.code ?? "refused"}`);
     else if (!silent) toast("ok", [DONE[verb] ?? words(verb), answer.text, verb === "pause" ? heldWords(answer.nodes) : ""].filter(Boolean).join(" · "));
     return answer;
@@ -68,6 +71,17 @@ export class Operator {
       return;
     }
     await this.give("estop", {});
+  }
+
+  /** Ask how the run is to go before it is started. */
+  async startWith() {
+    const { file } = this.link.state.mission;
+    const about = file ? await startForm(file) : null;
+    if (about) startDialog(about, file, (data) => this.give("start", data, false, true));
+  }
+
+  clearStop() {
+    clearDialog(this.link.state.mission.reason, () => this.give("clear_estop", {}, false, true));
   }
 
   /** A second press within three seconds carries out what cannot be undone. */
@@ -93,15 +107,17 @@ export class Operator {
     const may = this.link.mayAct;
     const now = stateOf(state);
     const live = ["running", "paused", "stopping"].includes(now);
-    const set = { start: may && !live && now !== "preparing", pause: may && now === "running", step: may && now === "paused", resume: may && now === "paused", abort: may && (live || now === "preparing") };
+    const set = { start: may && !live && now !== "preparing" && now !== "stopped", pause: may && now === "running", step: may && now === "paused", resume: may && now === "paused", abort: may && (live || now === "preparing") };
     for (const [verb, on] of Object.entries(set)) this.buttons[verb].disabled = !on;
     this.showTasks(state, may && !live && now !== "preparing");
     this.buttons.start.hidden = state.mission.starts === false;
     this.buttons.start.disabled ||= !state.task;
+    this.options.hidden = state.mission.starts === false || !state.mission.file;
+    this.options.disabled = this.buttons.start.disabled;
     this.clear.hidden = now !== "stopped";
     this.clear.disabled = !may;
     const why = may ? "" : "Take the controls first";
-    for (const button of Object.values(this.buttons)) attribute(button, "title", button.disabled && why ? why : null);
+    for (const button of [...Object.values(this.buttons), this.options, this.clear]) attribute(button, "title", button.disabled && why ? why : null);
     this.estop.disabled = false;
     this.showPause(state);
     this.showHolder(state);
@@ -169,7 +185,8 @@ export class Banner {
     this.state = h("span", { class: "state" });
     this.task = h("span", { class: "task-name" });
     this.time = h("span", { class: "time" });
-    this.root = h("div", { class: "banner", role: "status", "aria-label": "Mission state" }, this.state, this.task, this.time);
+    this.mode = h("span", { class: "mode", hidden: true });
+    this.root = h("div", { class: "banner", role: "status", "aria-label": "Mission state" }, this.state, this.task, this.mode, this.time);
   }
 
   update(state, now) {
@@ -177,5 +194,9 @@ export class Banner {
     text(this.state, stateWord(state));
     text(this.task, words(state.task?.name ?? "no task"));
     text(this.time, seconds(now));
+    const { from, mode, id } = state.mission;
+    this.mode.hidden = mode !== "lockstep" || !id;
+    text(this.mode, from ? `from record ${from.record}` : "simulated");
+    attribute(this.mode, "title", from ? `simulated from ${from.run}` : null);
   }
 }

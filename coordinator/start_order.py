@@ -1,0 +1,230 @@
+"""What an operator says when he starts a run from the page: read from plain data, refused with a word, and offered as a form.
+
+The page can ask for what `petrobot run` can: real time or lock step, number of runs, seed, the task's own parameters, learning
+into an estimates file; and, in lock step, a point of a recorded run to set out from.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import tomlkit
+from tomlkit.exceptions import TOMLKitError
+from tomlkit.items import Item
+
+from coordinator.departure import AGAIN
+from coordinator.learner import usual_contexts
+from coordinator.learning.selectors import DEFAULT, RULES
+from coordinator.learning_session import LearningSession, LearningSetting
+from coordinator.task import Task
+from services.comm.directory import Directory
+
+REALTIME, LOCKSTEP = "realtime", "lockstep"
+MODES: Final = (REALTIME, LOCKSTEP)
+SEED: Final = 1
+MOST_RUNS: Final = 1_000_000
+LARGEST_SEED: Final = 2**63 - 1
+SUFFIX: Final = ".db"
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,63}")
+_KINDS: Final = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
+_KNOWN: Final = frozenset({"task", "mode", "runs", "seed", "regime", "parameters", "learn", "pace", "from"})
+
+
+@dataclass(frozen=True)
+class Learn:
+    """Learning that was asked for, as `--learn`, `--selector`, `--target`, `--context` and `--frozen` do."""
+
+    path: Path
+    selector: str = DEFAULT
+    target: float | None = None
+    contexts: tuple[str, ...] | None = None
+    frozen: bool = False
+
+    def session(self, task: Task, directory: Directory, mode: str, seed: int) -> LearningSession:
+        """Open it. Raises EstimatesError, ValueError."""
+        declared = {a.name: a.compute_time for a in directory.actions.values()} if mode == LOCKSTEP else None
+        given = LearningSetting(self.path, self.selector, self.target, self.contexts, {}, self.frozen, declared)
+        return LearningSession(task, given, seed)
+
+
+@dataclass(frozen=True)
+class StartOrder:
+    """How a run is to be started."""
+
+    mode: str = REALTIME
+    runs: int | None = None
+    """None: as many as the task file says."""
+    seed: int = SEED
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    learn: Learn | None = None
+    pace: float = 1.0
+    """In lock step: simulated seconds a second at most; 0: as fast as it goes."""
+
+
+@dataclass(frozen=True)
+class DepartOrder:
+    """A simulated run from a point of a recorded one; None: as the recorded run had it."""
+
+    run: str
+    record: int
+    going: Mapping[str, str] | str = AGAIN
+    seed: int | None = None
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    pace: float = 1.0
+
+
+def read_start(task: Task, data: Mapping[str, Any], estimates: Path) -> StartOrder:
+    """What a client asked for. Raises ValueError that names the field, what is wrong with it, and what would do."""
+    _refuse_unknown(data)
+    mode = data.get("mode") or REALTIME
+    if mode not in MODES:
+        raise ValueError(f"mode: {mode!r} is none of {', '.join(MODES)}")
+    runs = data.get("runs")
+    if runs is not None:
+        if not task.runs_place:
+            raise ValueError(f"runs: {task.name} counts no runs (it names no runs_place)")
+        runs = _whole("runs", runs, 1, MOST_RUNS)
+    return StartOrder(
+        mode,
+        runs,
+        SEED if data.get("seed") is None else _whole("seed", data["seed"], 0, LARGEST_SEED),
+        read_parameters(task, _with_regime(data)),
+        None if data.get("learn") is None else _learn(data["learn"], estimates),
+        _pace(data.get("pace")),
+    )
+
+
+def read_depart(task: Task, data: Mapping[str, Any]) -> DepartOrder:
+    """A start with `from`: {run, record, going}. Raises ValueError."""
+    _refuse_unknown(data)
+    source = data["from"]
+    if not isinstance(source, Mapping) or not isinstance(source.get("run"), str):
+        raise ValueError("from: {run, record, going} is needed")
+    for name in ("runs", "learn"):
+        if data.get(name) is not None:
+            raise ValueError(f"{name}: a run from a point of another takes none; it stands where the other stood")
+    if data.get("mode", LOCKSTEP) != LOCKSTEP:
+        raise ValueError(
+            "mode: a run from a point of another is simulated; a real cell does not stand where a marking says"
+        )
+    going = source.get("going", AGAIN)
+    if isinstance(going, Mapping):
+        going = {str(place): str(word) for place, word in going.items()}
+    elif not isinstance(going, str):
+        raise ValueError(f"from.going: {going!r} is no word and no object of words by place")
+    seed = None if data.get("seed") is None else _whole("seed", data["seed"], 0, LARGEST_SEED)
+    record = _whole("from.record", source.get("record", 0), 0, 2**53)
+    return DepartOrder(
+        source["run"], record, going, seed, read_parameters(task, _with_regime(data)), _pace(data.get("pace"))
+    )
+
+
+def read_parameters(task: Task, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Parameters that a client gave, in the task's own types. Raises ValueError."""
+    made = {}
+    for name, value in given.items():
+        if name not in task.parameters:
+            raise ValueError(f"{task.name} has no parameter {name!r}; it has: {', '.join(task.parameters) or 'none'}")
+        kind = type(task.parameters[name])
+        if kind is float and type(value) is int:
+            value = float(value)
+        if type(value) is not kind or (kind is float and value - value != 0):
+            raise ValueError(f"parameter {name}: {value!r} is not {_KINDS[kind]}")
+        made[name] = value
+    return made
+
+
+def learned_of(session: LearningSession, *, interrupted: bool) -> dict[str, Any]:
+    """Save what a run learned; what its result says of it. Raises EstimatesError."""
+    session.setting.path.parent.mkdir(parents=True, exist_ok=True)
+    counted = session.save(interrupted=interrupted)
+    told = {
+        "file": session.setting.path.name,
+        "selector": session.setting.selector,
+        "context": session.selector.context,
+    }
+    return {"learned": {**told, "runs_counted": counted}}
+
+
+def start_form(task: Task, text: str, estimates: Path) -> dict[str, Any]:
+    """What may be asked for when this task is started, with types and defaults; `text` is the task file's."""
+    place = task.places.get(task.runs_place) if task.runs_place else None
+    remarks = _remarks(text)
+    return {
+        "task": task.name,
+        "runs": None if place is None else {"default": place.tokens, "place": place.name},
+        "seed": SEED,
+        "modes": list(MODES),
+        "parameters": [
+            {"name": name, "type": type(value).__name__, "default": value, "text": remarks.get(name, "")}
+            for name, value in task.parameters.items()
+        ],
+        "learn": {
+            "selectors": list(RULES),
+            "selector": DEFAULT,
+            "contexts": list(usual_contexts(task).parts),
+            "estimates": sorted(p.stem for p in estimates.glob(f"*{SUFFIX}") if _NAME.fullmatch(p.stem)),
+        },
+    }
+
+
+def _refuse_unknown(data: Mapping[str, Any]) -> None:
+    unknown = sorted(set(data) - _KNOWN)
+    if unknown:
+        raise ValueError(f"start knows no {', '.join(map(repr, unknown))}; it knows {', '.join(sorted(_KNOWN))}")
+
+
+def _whole(name: str, value: Any, least: int, most: int) -> int:
+    if type(value) is not int or not least <= value <= most:
+        raise ValueError(f"{name}: {value!r} is no whole number from {least} to {most}")
+    return value
+
+
+def _pace(value: Any) -> float:
+    if value is None:
+        return 1.0
+    if type(value) not in (int, float) or not 0 <= value <= 1000:
+        raise ValueError(f"pace: {value!r} is no number from 0 (as fast as it goes) to 1000 times real time")
+    return float(value)
+
+
+def _with_regime(data: Mapping[str, Any]) -> dict[str, Any]:
+    given = data.get("parameters") or {}
+    if not isinstance(given, Mapping):
+        raise ValueError(f"parameters: {given!r} is no object of values by name")
+    return {str(k): v for k, v in given.items()} | ({} if data.get("regime") is None else {"regime": data["regime"]})
+
+
+def _learn(given: Any, folder: Path) -> Learn:
+    if not isinstance(given, Mapping):
+        raise ValueError("learn: {file, selector, target, contexts, frozen} is needed")
+    name, selector = given.get("file"), given.get("selector") or DEFAULT
+    if not isinstance(name, str) or not _NAME.fullmatch(name):
+        raise ValueError(
+            f"learn.file: {name!r} is no name of letters, digits, _ and -, 64 at most; it is kept in {folder}"
+        )
+    if selector not in RULES:
+        raise ValueError(f"learn.selector: {selector!r} is none of {', '.join(RULES)}")
+    target, contexts, frozen = given.get("target"), given.get("contexts"), given.get("frozen", False)
+    if target is not None and (type(target) not in (int, float) or not 0 < target <= 1):
+        raise ValueError(f"learn.target: {target!r} is no reliability above 0 and at most 1")
+    if contexts is not None and not (isinstance(contexts, list) and all(isinstance(c, str) for c in contexts)):
+        raise ValueError("learn.contexts: a list of names or conditions is needed")
+    if type(frozen) is not bool:
+        raise ValueError(f"learn.frozen: {frozen!r} is neither true nor false")
+    parts = None if contexts is None else tuple(c for c in contexts if c.strip())
+    return Learn(folder / f"{name}{SUFFIX}", selector, None if target is None else float(target), parts, frozen)
+
+
+def _remarks(text: str) -> dict[str, str]:
+    """The comments behind the task file's parameters: what they mean, in its author's words."""
+    try:
+        table = tomlkit.parse(text)["task"]["parameters"]
+    except (TOMLKitError, KeyError, TypeError):
+        return {}
+    items = table.items() if hasattr(table, "items") else ()
+    return {name: item.trivia.comment.lstrip("# ").strip() for name, item in items if isinstance(item, Item)}
