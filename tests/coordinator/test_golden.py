@@ -17,6 +17,9 @@ ENDS = {
     "catch_ball-undisturbed": ("success", 4),
     "catch_ball-missed-and-recovered": ("success", 4),
     "catch_ball-given-up": ("error", 1),
+    "follow_track-undisturbed": ("success", 1),
+    "follow_track-lost-and-found": ("success", 1),
+    "follow_track-given-up": ("error", 1),
 }
 
 

@@ -23,6 +23,13 @@ FOLDER = Path(__file__).parent
 GOOD = Line(seconds=(0.2, 0.2))
 FAULT = Line(Status.ERROR, (0.1, 0.1), cause="drive_fault", text="drive 3: following error")
 MISSED = Line(Status.FAILURE, (0.3, 0.3), cause="missed")
+END = [4.0, 2.0, 0.0]
+GOES_ON = Line(seconds=(3.0, 3.0), values={"at_t": False, "line_end": END})
+ENDS_AT_T = Line(seconds=(3.0, 3.0), values={"at_t": True, "line_end": END})
+FOUND = Line(seconds=(2.0, 2.0), values={"recovered": True})
+NOT_FOUND = Line(Status.FAILURE, (2.5, 2.5), {"recovered": False}, "no_track")
+LOST = Line(Status.ERROR, (1.0, 1.0), cause="no_line", text="no line to follow for 0.5 s")
+UNSEEN = Line(Status.ERROR, (4.0, 4.0), cause="no_line", text="the line was lost for 0.8 s")
 STORIES: Mapping[str, tuple[str, int, Mapping[str, list[Line]]]] = {
     "catch_ball-undisturbed": ("catch_ball", 4, {}),
     "catch_ball-missed-and-recovered": (
@@ -35,6 +42,35 @@ STORIES: Mapping[str, tuple[str, int, Mapping[str, list[Line]]]] = {
         },
     ),
     "catch_ball-given-up": ("catch_ball", 2, {"return_home": [FAULT], "recover_arm": [FAULT]}),
+    "follow_track-undisturbed": (
+        "follow_track",
+        1,
+        {
+            "follow_track": [GOES_ON, ENDS_AT_T],
+            "watch_track": [GOES_ON, ENDS_AT_T],
+            "recover_track": [FOUND],
+        },
+    ),
+    "follow_track-lost-and-found": (
+        "follow_track",
+        1,
+        {
+            "follow_track": [GOES_ON, GOES_ON, LOST, FAULT, ENDS_AT_T],
+            "watch_track": [GOES_ON, UNSEEN, GOES_ON, ENDS_AT_T],
+            "recover_track": [NOT_FOUND, FOUND],
+            "search_track": [FOUND],
+            "stop_at_t": [FAULT, GOOD],
+        },
+    ),
+    "follow_track-given-up": (
+        "follow_track",
+        1,
+        {
+            "follow_track": [LOST],
+            "watch_track": [GOES_ON],
+            "search_track": [NOT_FOUND],
+        },
+    ),
 }
 """Name of a journal: task, runs, and what its actions do."""
 
