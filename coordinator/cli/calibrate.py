@@ -4,19 +4,50 @@ from __future__ import annotations
 
 import argparse
 
-EXAMPLE = "petrobot calibrate --views board_images --output calibration.toml"
+from coordinator.cli import CommandError
+
+EXAMPLE = "petrobot calibrate --views board_images --simulated --output calibration.toml"
 ROOM = "services.vision.calibrate"
+LABORATORY = "sim.board:main"
+"""Takes board images with the simulated camera as it truly hangs: `main([folder])`."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options are the calibration's own."""
+    """The options are the calibration's own, and one that makes images first."""
     from coordinator.launch import load_object
 
     load_object(f"{ROOM}:add_arguments")(parser)
+    parser.add_argument(
+        "--simulated",
+        action="store_true",
+        help="take the board images with the simulated camera first, into an empty DIR",
+    )
 
 
 def run(options: argparse.Namespace) -> int:
-    """Calibrate."""
+    """Take images if asked to; calibrate."""
     from coordinator.launch import load_object
 
+    if options.simulated:
+        _take(options)
     return int(load_object(f"{ROOM}:run")(options))
+
+
+def _take(options: argparse.Namespace) -> None:
+    from coordinator.launch import load_object
+
+    folder = options.views
+    if options.source:
+        raise CommandError(
+            2, f"--simulated takes all images, so none is left for --source {options.source}; leave one out"
+        )
+    try:
+        if folder.exists() and any(folder.iterdir()):
+            raise CommandError(
+                2, f"{folder} is not empty; give --simulated a folder that is, so that nothing is overwritten"
+            )
+        load_object(LABORATORY)([str(folder)])
+    except OSError as fault:
+        raise CommandError(
+            2, f"{folder}: {fault.strerror or fault}; give --views a folder that can be written"
+        ) from fault

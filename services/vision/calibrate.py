@@ -49,16 +49,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, say: Callable[[str], None] = print, wait: Callable[[str], str] = input) -> int:
     """Calibrate; gives the exit code. `say` prints, `wait` asks the operator to place the board."""
+    if not options.output.parent.is_dir():  # told before the work, not after it
+        print(f"calibrate: {options.output}: there is no folder {options.output.parent}; make it", file=sys.stderr)
+        return EXIT_BAD_INPUT
     try:
         if options.source:
             config = {"source": options.source, "address": options.address}
             take_missing(options.views, open_images(config, time.monotonic), say, wait)
         views, board = read_views(options.views)
         found = calibrate(views, board)
+        options.output.write_text(calibration_text(found), encoding="utf-8")
     except (CalibrationError, CalibrationFileError, ConnectionError, ValueError) as fault:
         print(f"calibrate: {fault}", file=sys.stderr)
         return EXIT_BAD_INPUT
-    options.output.write_text(calibration_text(found), encoding="utf-8")
+    except OSError as fault:
+        print(f"calibrate: {fault.filename or options.output}: {fault.strerror or fault}", file=sys.stderr)
+        return EXIT_BAD_INPUT
     say(report(found, len(views)))
     say(f"written to {options.output}")
     return 0

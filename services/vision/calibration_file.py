@@ -130,6 +130,10 @@ def _pose(entry: Mapping[str, Any], path: Path) -> Array | None:
 
 
 def _grey(path: Path) -> NDArray[np.uint8]:
+    if not path.is_file():  # OpenCV would warn in words of its own
+        raise CalibrationFileError(
+            f"{path}: not there; mend `file` in views.toml, or take it: petrobot calibrate --source"
+        )
     pixels = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     if pixels is None:
         raise CalibrationFileError(f"{path}: no image; mend `file` in views.toml or take the image again")

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from coordinator.cli import main
 from services.vision import calibrate as command
 from services.vision.calibration import Board, BoardView, Calibration, CalibrationError, adjust, calibrate, find_corners
 from services.vision.calibration_file import (
@@ -21,7 +22,6 @@ from services.vision.calibration_file import (
 )
 from services.vision.optics import Array, Optics
 from sim.board import HELD, LAID, board_views, save_board_views
-from sim.board import main as board_command
 from sim.camera import PinholeCamera
 from tests.vision.test_optics import drawn_optics
 
@@ -185,7 +185,7 @@ def test_command_writes_what_the_driver_reads(
         (None, "cannot be read"),
         ("[board", "no TOML"),
         ("[board]\ncolumns = 9\nrows = 6\n", "key 'square' is missing"),
-        ('[board]\ncolumns=9\nrows=6\nsquare=0.06\n[[views]]\nfile="a.png"\n', "a.png: no image"),
+        ('[board]\ncolumns=9\nrows=6\nsquare=0.06\n[[views]]\nfile="a.png"\n', "a.png: not there"),
         ('[board]\ncolumns=9\nrows=6\nsquare=0.06\n[[views]]\nfile="a.png"\npose=[1]\n', "4 rows of 4"),
     ],
 )
@@ -247,11 +247,17 @@ def test_measured_places_differ_from_true_ones(cell: dict[str, Any], pinhole: Pi
     assert 0.01 < np.abs((first - wanted).mean(axis=0)).max() < 0.6
 
 
-@pytest.mark.proof
-def test_shipped_calibration_is_what_the_commands_make(tmp_path: Path, pinhole: PinholeCamera) -> None:
-    """The two commands of docs/vision.md, from the simulated camera's images to the shipped file."""
-    assert board_command([str(tmp_path / "views")]) == 0
-    assert command.calibrate_main(["--views", str(tmp_path / "views"), "--output", str(tmp_path / "made.toml")]) == 0
-    made = parse_calibration((tmp_path / "made.toml").read_text(encoding="utf-8"), "made.toml")
-    shipped = parse_calibration(DEFAULT.read_text(encoding="utf-8"), DEFAULT.name)
-    assert table_error(made.optics, shipped.optics).max() < 0.02e-3
+def test_shipped_calibration_is_what_the_command_makes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`--simulated` takes all images first and then calibrates, to the shipped file; it never writes over what is there."""
+    views, made = tmp_path / "views", tmp_path / "made.toml"
+    told = ["calibrate", "--views", str(views), "--simulated", "--output", str(made)]
+    assert main([*told, "--source", "capture:0"]) == 2
+    assert "leave one out" in capsys.readouterr().err and not views.exists()
+    assert main(told) == 0
+    optics = [parse_calibration(f.read_text(encoding="utf-8"), f.name).optics for f in (made, DEFAULT)]
+    assert table_error(*optics).max() < 0.02e-3
+    capsys.readouterr()
+    assert main(told) == 2
+    assert f"{views} is not empty" in capsys.readouterr().err
+    assert main(["calibrate", "--views", str(views), "--output", str(tmp_path / "nowhere" / "c.toml")]) == 2
+    assert "nowhere/c.toml: there is no folder" in capsys.readouterr().err
