@@ -27,6 +27,7 @@ from sim.track_floor import Floor, Picture
 from sim.track_light import Hall
 from sim.track_referee import Referee
 from sim.track_truth import RoverTruth, TrackSite, TrackTruth, track_site_of
+from sim.truth import LaboratoryError
 
 REGIME: Final = "straight"
 """The regime if none is asked for."""
@@ -154,9 +155,9 @@ class TrackLaboratory(LaboratoryParty):
     def serve(self, service: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Answer one of `services`. Raises ValueError (LaboratoryError, TrackError among them) for arguments that cannot be.
 
-        laboratory_prepare(seed=0, regime="straight", elements=None, interruptions=None): a new experiment, gives nothing; other
-        parameters of the task are not the laboratory's business; laboratory_score(): see sim.track_referee;
-        laboratory_fault(kind, after=0, ...): see sim.track_faults.
+        laboratory_prepare(seed=0, regime="straight", elements=None, interruptions=None, speed=None): a new experiment, gives
+        nothing; `speed` (m/s) is refused if no wheel goes so fast; other parameters of the task are not the laboratory's
+        business; laboratory_score(): see sim.track_referee; laboratory_fault(kind, after=0, ...): see sim.track_faults.
         """
         if service == SCORE:
             return self.referee.score(self.now)
@@ -166,6 +167,7 @@ class TrackLaboratory(LaboratoryParty):
             return {}
         seed = whole_number(arguments, "seed", 0) or 0
         truth = self._site.truth(str(arguments.get("regime", REGIME)))
+        _check_speed(arguments.get("speed"), truth.rover)
         elements, interruptions = (whole_number(arguments, key, None) for key in ("elements", "interruptions"))
         self._prepare(seed, truth, truth.course.track(seed, elements, interruptions))
         return {}
@@ -183,6 +185,15 @@ def _put_down(start: Pose, rover: RoverTruth, draws: np.random.Generator) -> Pos
     dx, dy, turn = draws.standard_normal(3).tolist()
     aside, heading = rover.settings["placed"], rover.settings["placed_heading"]
     return Pose(start.x + aside * dx, start.y + aside * dy, start.heading + heading * turn)
+
+
+def _check_speed(speed: object, rover: RoverTruth) -> None:
+    """Raise LaboratoryError for a speed (m/s) that the rover cannot have."""
+    most = round(rover.top_speed * min(wheel.radius for wheel in rover.wheels), 1)
+    if speed is not None and not (isinstance(speed, int | float) and 0.0 < speed <= most):
+        raise LaboratoryError(
+            f"speed = {speed!r}: give one above 0 and up to {most} m/s, which is what the wheels can do"
+        )
 
 
 _WATCH: Final = 0.02

@@ -123,6 +123,17 @@ def test_the_image_shows_the_track_ahead(rover_bench: Bench) -> None:
 # Regimes and services
 
 
+@pytest.mark.parametrize("speed", [0, 0.0, -0.5, 1.3, 5, "fast", float("nan")])
+def test_a_speed_that_no_wheel_has_is_refused_with_what_can_be(rover_bench: Bench, speed: object) -> None:
+    ended = rover_bench().call("laboratory_prepare", seed=1, regime="plain", speed=speed)
+    assert ended.status == "error" and "speed" in ended.text and "1.2 m/s" in ended.text
+
+
+@pytest.mark.parametrize("speed", [1, 0.05, 1.2])
+def test_a_speed_that_the_wheels_have_is_taken(rover_bench: Bench, speed: float) -> None:
+    assert rover_bench().call("laboratory_prepare", seed=1, regime="plain", speed=speed).status == "success"
+
+
 def test_every_regime_and_every_disturbance_can_be_prepared(track_site: TrackSite, rover_bench: Bench) -> None:
     bench = rover_bench()
     for regime in track_site.settings["regimes"]:
