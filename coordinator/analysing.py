@@ -29,6 +29,7 @@ WORDS = {
     "proper": "Ready for the next mission, whatever happened",
     "reversible": "Can come back to its beginning",
     "one_run_each": "One run at a time in each action place",
+    "returned": "Every resource is back at the end",
     "sound": "Can end properly from everywhere",
     "stable": "Comes back to its nominal flow after errors",
     "controllable": "Every error can be recovered from",

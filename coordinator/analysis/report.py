@@ -10,12 +10,13 @@ import numpy as np
 
 from coordinator.analysis.coverability import Coverability, settle_bounds
 from coordinator.analysis.forecast import Forecast, forecast
+from coordinator.analysis.graph import Mask
 from coordinator.analysis.gspn import Chain, Gspn
 from coordinator.analysis.markov import LongRun, long_run
 from coordinator.analysis.ordinary import OrdinaryView
 from coordinator.analysis.pumping import find_pump
 from coordinator.analysis.qualitative import Qualitative, examine
-from coordinator.analysis.robot import Recovery, RobotVerdicts, judge, one_run_each
+from coordinator.analysis.robot import Recovery, RobotVerdicts, all_returned, judge, one_run_each
 from coordinator.analysis.space import INTERRUPTED, EngineName, Limits, Space, explore
 from coordinator.analysis.stochastic import Measured, stochastic_view
 from coordinator.analysis.structural import Structure
@@ -43,6 +44,8 @@ class Analysis:
     notes: tuple[str, ...]
     one_run_each: Verdict | None = None
     """Of a task: whether no action place is entered while its run goes on."""
+    returned: Verdict | None = None
+    """Of a task: whether each resource is there again at the end."""
     interrupted: bool = False
     """Whether Ctrl-C kept something from being found out."""
 
@@ -53,9 +56,23 @@ class Analysis:
 
     @property
     def ok(self) -> bool:
-        """Whether nothing speaks against running it: bounded, free from deadlock, one run at a time in an action place."""
-        crowded = self.one_run_each is not None and self.one_run_each.holds is not True
-        return self.qualitative.bounded.holds is True and self.qualitative.deadlock_free.holds is True and not crowded
+        """Whether it is known that nothing speaks against running it."""
+        first = self.qualitative.bounded.holds is True and self.qualitative.deadlock_free.holds is True
+        single = self.one_run_each is None or self.one_run_each.holds is True
+        return first and single and not self.objections
+
+    @property
+    def objections(self) -> dict[str, Verdict]:
+        """What is known to speak against running it: it grows without bound, gets stuck, starts a run while its place is at
+        work, cannot reach its end, goes on at its end, or ends without a resource. (A transition of no use is no objection.)
+        """
+        named = self.verdicts()
+        against = {
+            name: named[name] for name in ("bounded", "deadlock_free", "one_run_each", "returned") if name in named
+        }
+        if "sound" in named and named["sound"].witness is not None:
+            against["sound"] = named["sound"]
+        return {name: verdict for name, verdict in against.items() if verdict.holds is False}
 
     def to_json(self, *, structure: bool = True) -> dict[str, Any]:
         """Plain data with the promised keys: verdicts are true, false or null."""
@@ -130,6 +147,8 @@ class Analysis:
         out |= {"live": again.live, "proper" if self.closed else "reversible": again.reversible}
         if self.one_run_each is not None:
             out["one_run_each"] = self.one_run_each
+        if self.returned is not None:
+            out["returned"] = self.returned
         if q.sound is not None:
             out["sound"] = q.sound
         if self.robot is not None:
@@ -276,16 +295,33 @@ def _analyse_task(
     found = _examined(ordinary.net, limits, engine, notes, ordinary.is_end)
     single = [p.name for p in task.flat.places.values() if p.kind is Kind.ACTION and p.servers is None]
     alone, whole = one_run_each(found.space, single), Structure(ordinary.net)
-    closed = robot = numbers = None
+    closed = robot = numbers = back = None
     try:
         if not notes:
+            resources = [p.name for p in task.flat.places.values() if p.kind is Kind.RESOURCE]
+            final = found.space.where(ordinary.is_final)
+            back = all_returned(found.space, final, resources)
+            notes += _uneven(found.space, final)
             closed, robot = _closed(ordinary, found.space, limits, engine, notes)
         if view == "gspn" and CUT not in notes:
             numbers = _forecast(task, measured, stages, limits, notes)
     except KeyboardInterrupt:
         notes.append(CUT)
     stopped = CUT in notes
-    return Analysis(task.name, ordinary.net, found, closed, robot, whole, None, numbers, tuple(notes), alone, stopped)
+    return Analysis(
+        task.name, ordinary.net, found, closed, robot, whole, None, numbers, tuple(notes), alone, back, stopped
+    )
+
+
+def _uneven(space: Space, final: Mask) -> list[str]:
+    """A note on each place whose tokens at the end depend on the way: left over, lost, or counted on purpose."""
+    ends = np.flatnonzero(final)
+    held = [(name, space.tokens(p)[ends]) for p, name in enumerate(space.net.places)] if len(ends) else []
+    return [
+        f"{name} holds {tokens.min()} to {tokens.max()} tokens at the end, depending on the way"
+        for name, tokens in held
+        if tokens.min() < tokens.max()
+    ]
 
 
 def _closed(

@@ -88,6 +88,22 @@ def one_run_each(space: Space, places: Sequence[str]) -> Verdict:
     return Verdict(True, "no action place is entered while its run goes on")
 
 
+def all_returned(space: Space, final: Mask, resources: Sequence[str]) -> Verdict:
+    """Whether every resource place holds at each final marking what it began with: none was lost, none appeared."""
+    for name in resources:
+        p = space.net.place_index[name]
+        began, other = space.net.initial[p], np.flatnonzero(final & (space.tokens(p) != space.net.initial[p]))
+        if len(other):
+            shown = witness(space, int(other[0]))
+            left = shown.marking.get(name, 0)
+            word = "lost" if left < began else "made"
+            reason = f"{name} is {word} on the way: {began} at the beginning, {left} at the end"
+            return Verdict(False, reason, shown, complete=space.complete)
+    if not space.complete:
+        return Verdict(None, f"the search stopped: {space.reason}", complete=False)
+    return Verdict(True, "every resource is there again at the end, none was lost or made")
+
+
 class Flow:
     """A complete space seen through its roles: masks over markings and edges."""
 

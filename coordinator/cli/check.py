@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from coordinator.cli.loading import (
     add_services_argument,
@@ -53,19 +53,20 @@ def run(options: argparse.Namespace) -> int:
         offers = {action: directory.where(action) for action in directory.actions}
     report = check(task, offers)
     missing = _missing(task, services) if options.live else []
-    analysis = None if report.errors else _analysed(task)
-    ok = report.ok and (analysis is None or not _stuck(analysis))
+    broken = any(finding.code == "inconsistent" for finding in report.errors)
+    analysis = None if broken else _analysed(task)
+    ok = report.ok and (analysis is None or not analysis.objections)
     live = {"live": missing} if options.live else {}
     if options.json:
-        found = {} if analysis is None else {"analysis": analysis.to_json(structure=False)}
+        found = {} if analysis is None else _plain_analysis(analysis)
         write_json(options.json, {"task": task.name, "ok": ok, "findings": _plain(report), **found, **live})
     if options.json != "-":
         print(
             "\n".join(
-                [*(f"missing {line}" for line in missing), _text(task.name, report, analysis, ok and not missing)]
+                [*(f"missing {line}" for line in missing), _text(options.task, report, analysis, ok and not missing)]
             )
         )
-    return 2 if not ok else 3 if missing else 0
+    return 2 if not ok else 130 if analysis is not None and analysis.interrupted else 3 if missing else 0
 
 
 def _missing(task: Task, services: Path | None) -> list[str]:
@@ -99,11 +100,10 @@ def _analysed(task: Task) -> Analysis:
     return analyse(task, limits=limits)
 
 
-def _stuck(analysis: Analysis) -> bool:
-    """Whether it is known to grow without bound, to come to a deadlock or to start a run while its place is at work; what was
-    not settled in time does not forbid it."""
-    verdicts = analysis.verdicts()
-    return any(verdicts[name].holds is False for name in ("bounded", "deadlock_free", "one_run_each"))
+def _plain_analysis(analysis: Analysis) -> dict[str, Any]:
+    data = analysis.to_json(structure=False)
+    objections = {name: verdict.to_json() for name, verdict in analysis.objections.items()}
+    return {"complete": data["complete"], "objections": objections, "analysis": data}
 
 
 def _plain(report: Report) -> list[dict[str, str]]:
@@ -112,6 +112,7 @@ def _plain(report: Report) -> list[dict[str, str]]:
 
 
 def _text(name: str, report: Report, analysis: Analysis | None, ok: bool) -> str:
+    ended = ""
     lines = [
         f"{f.severity:8}{f.key}: {f.text}" + (f"\n        {f.remedy}" if f.remedy else "") for f in report.findings
     ]
@@ -124,7 +125,20 @@ def _text(name: str, report: Report, analysis: Analysis | None, ok: bool) -> str
             if analysis.qualitative.space.complete
             else "; the search was cut short (petrobot analyse goes on longer)"
         )
+        lines += [f"{'note':8}final: {note}" for note in analysis.notes]
         lines.append(f"{len(analysis.qualitative.space)} markings: {', '.join(told)}{searched}")
-        if _stuck(analysis):
+        lines += _objections(analysis)
+        if analysis.objections:
             lines.append(f"petrobot analyse {name} --pictures FOLDER shows how it comes to that")
-    return "\n".join([*lines, f"{name}: {'may run' if ok else 'may not run'}"])
+        ended = "was not checked to its end (Ctrl-C)" if ok and analysis.interrupted else ""
+    return "\n".join([*lines, f"{name}: {ended or ('may run' if ok else 'may not run')}"])
+
+
+def _objections(analysis: Analysis) -> list[str]:
+    """What speaks against running it, each with the firings that lead there."""
+    lines = []
+    for name, verdict in analysis.objections.items():
+        lines.append(f"{'error':8}{name.replace('_', ' ')}: {verdict.reason}")
+        if verdict.witness is not None:
+            lines.append(f"        by: {' '.join(verdict.witness.firings) or '(initial marking)'}")
+    return lines

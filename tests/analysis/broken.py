@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -62,6 +62,28 @@ VARIANTS: dict[str, Callable[[Task], Task]] = {
     "double_resource": double_resource,
     "leaking_token": leaking_token,
 }
+
+
+def damaged(task: Task) -> Iterator[tuple[str, Task]]:
+    """Damage of all kinds that a hand does to a task file: arcs lost, doubled, led elsewhere or added, tokens changed."""
+    for t in task.transitions.values():
+        for i, o in enumerate(t.outputs):
+            others = (*t.outputs[:i], *t.outputs[i + 1 :])
+            yield f"{t.name} no longer gives {o.place}", _with(task, replace(t, outputs=others))
+            yield f"{t.name} gives {o.place} twice", _with(task, replace(t, outputs=(*others, replace(o, weight=2))))
+            for p in task.places.values():
+                if p.kind is task.places[o.place].kind and p.name not in {x.place for x in t.outputs}:
+                    outputs = (*others, replace(o, place=p.name))
+                    yield f"{t.name} gives {p.name} for {o.place}", _with(task, replace(t, outputs=outputs))
+        for i, a in enumerate(t.inputs):
+            rest = (*t.inputs[:i], *t.inputs[i + 1 :])
+            yield f"{t.name} no longer takes {a.place}", _with(task, replace(t, inputs=rest))
+        if t.inhibitors:
+            yield f"{t.name} is no longer barred", _with(task, replace(t, inhibitors=()))
+    for p in task.places.values():
+        if p.kind is not Kind.ACTION:
+            more = replace(p, tokens=p.tokens + 1, capacity=None)
+            yield f"{p.name} holds one more", replace(task, places={**task.places, p.name: more})
 
 
 def judged(task: Task) -> Analysis:

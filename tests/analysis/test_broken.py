@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
 
+from coordinator.analysis.ordinary import OrdinaryView
 from coordinator.analysis.robot import one_run_each
 from coordinator.analysis.space import Limits, explore
 from coordinator.cli import main
 from coordinator.cli.witnesses import draw_witnesses, refused
 from coordinator.drawing import Overlay, draw
 from coordinator.net import Net
+from coordinator.task import Kind, Task
 from coordinator.taskfile import dumps, load
-from tests.analysis.broken import TASKS, VARIANTS, judged
+from tests.analysis.broken import TASKS, VARIANTS, damaged, judged
+from tests.analysis.random_nets import brute_force
 
 SHIPPED = sorted(TASKS.glob("*.toml"))
 EXPECTED = {
@@ -54,6 +59,64 @@ def test_broken_variants_are_caught(path: Path, kind: str, tmp_path: Path) -> No
     texts = [e.text or "" for e in root.iter() if e.get("class") == "turn"]
     turns = sorted(int(turn) for text in texts for turn in text.replace("…", "").split(",") if turn.strip())
     assert turns and turns[-1] == len(verdict.witness.firings)
+
+
+def faults_by_brute_force(task: Task) -> set[str]:
+    """What is wrong with a task by its markings alone, looked at one by one."""
+    found = brute_force(task.net, 5000)
+    if found is None:
+        return {"bounded"}
+    order, edges = found
+    names, view = task.net.places, OrdinaryView(task)
+    out, good = set[str](), {i for i, m in enumerate(order) if view.is_end(m)}
+    busy = {i for i, _, _ in edges}
+    out |= {"sound"} if good & busy else set()
+    ended, before = good.copy(), {j: set[int]() for j in range(len(order))}
+    for i, _, j in edges:
+        before[j].add(i)
+    while good:
+        good = set().union(*(before[j] for j in good)) - ended
+        ended |= good
+    out |= {"sound"} if len(ended) < len(order) else set()
+    single = [p.name for p in task.flat.places.values() if p.kind is Kind.ACTION and p.servers is None]
+    out |= {"one_run_each"} if any(m[names.index(p)] > 1 for m in order for p in single) else set()
+    resources = [names.index(p.name) for p in task.flat.places.values() if p.kind is Kind.RESOURCE]
+    ends = [m for m in order if view.is_final(m)]
+    return out | ({"returned"} if any(m[p] != order[0][p] for m in ends for p in resources) else set())
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_damage_of_any_kind_is_refused_if_it_hurts(path: Path, tmp_path: Path) -> None:
+    """Every few of all the damage that can be done by hand: the gate refuses what hangs or leaks, and its witness replays."""
+    refused_, harmless = 0, 0
+    for what, task in list(damaged(load(path)))[::9]:
+        file = tmp_path / "damaged.toml"
+        file.write_text(dumps(task), encoding="utf-8")
+        code = main(["check", str(file), "--json", str(tmp_path / "found.json")])
+        found = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))
+        wrong = faults_by_brute_force(task)
+        assert code == 2 or not wrong, (what, wrong)
+        if "objections" in found and not (wrong == {"bounded"} and not found["complete"]):
+            assert set(found["objections"]) - {"deadlock_free"} == wrong, what
+        for verdict in found.get("objections", {}).values():
+            *_, last = task.net.replay(verdict["witness"]["firings"])
+            assert {p: n for p, n in zip(task.net.places, last, strict=True) if n} == verdict["witness"]["marking"], (
+                what
+            )
+        refused_, harmless = refused_ + bool(wrong), harmless + (not wrong)
+    assert refused_ >= 5 and harmless >= 1
+
+
+def test_a_task_that_goes_round_and_never_ends_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """No deadlock, no token too many: after the damage the rover's stop can fail for ever, with no way to an end."""
+    task = load(TASKS / "follow_track.toml")
+    lost = task.transitions["stop_failed"]
+    outputs = tuple(replace(o, place="camera_idle") if o.place == "trouble" else o for o in lost.outputs)
+    path = tmp_path / "round.toml"
+    path.write_text(dumps(replace(task, transitions={**task.transitions, lost.name: replace(lost, outputs=outputs)})))
+    assert main(["check", str(path)]) == 2
+    told = capsys.readouterr().out
+    assert "sound: from" in told and "no designed end can be reached" in told and "by: " in told
 
 
 def test_the_gate_refuses_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
