@@ -3,24 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+from coordinator.drawing.layers import Edge, Layers, Spot
 
 Point = tuple[float, float]
-Edge = tuple[str, str]
 
 COLUMN = 120.0
 ROW = 105.0
 MARGIN = 80.0
-_SWEEPS = 8
+_BESIDE_NODE = 58.0
+_BESIDE_ARC = 24.0
+_SETTLINGS = 20
+_STRAIGHT = (1.0, 3.0, 9.0)
+"""How much a step wants to be level: between nodes, from a node to a way point, between way points."""
 
 
-def lay_out(wanted: Mapping[str, Point | None], edges: Sequence[Edge], sources: Sequence[str]) -> dict[str, Point]:
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """A position for every node, and the points by which arcs over several columns are led."""
+
+    at: Mapping[str, Point]
+    through: Mapping[Edge, Sequence[Point]] = field(default_factory=dict)
+
+
+def lay_out(wanted: Mapping[str, Point | None], edges: Sequence[Edge], sources: Sequence[str]) -> Layout:
     """A position for every node. `sources` are the nodes from which the flow begins (the marked places)."""
     given = {name: at for name, at in wanted.items() if at is not None}
     if len(given) == len(wanted):
-        return given
+        return Layout(given)
     if 2 * len(given) >= len(wanted):
-        return _fill_in(list(wanted), given, edges)
-    return _layers(list(wanted), edges, sources)
+        return Layout(_fill_in(list(wanted), given, edges))
+    return _layered(list(wanted), edges, sources)
 
 
 def _fill_in(names: Sequence[str], given: Mapping[str, Point], edges: Sequence[Edge]) -> dict[str, Point]:
@@ -50,77 +65,65 @@ def _free_spot(centre: Point, taken: Sequence[Point]) -> Point:
         ring += 1
 
 
-def _layers(names: Sequence[str], edges: Sequence[Edge], sources: Sequence[str]) -> dict[str, Point]:
-    """Columns by the longest way from the sources once circles are cut; rows ordered by neighbours (barycentre sweeps)."""
-    forward = _without_circles(names, edges, sources)
-    layer = _longest_ways(names, forward)
-    columns: list[list[str]] = [[] for _ in range(max(layer.values(), default=0) + 1)]
-    for name in names:
-        columns[layer[name]].append(name)
-    neighbours: dict[str, list[str]] = {n: [] for n in names}
-    for a, b in edges:
-        neighbours[a].append(b)
-        neighbours[b].append(a)
-    for sweep in range(_SWEEPS):
-        _sweep(columns if sweep % 2 == 0 else columns[::-1], neighbours)
-    tallest = max((len(c) for c in columns), default=0)
-    return {
-        name: (MARGIN + i * COLUMN, MARGIN + (j + (tallest - len(column)) / 2) * ROW)
-        for i, column in enumerate(columns)
-        for j, name in enumerate(column)
-    }
+def _layered(names: Sequence[str], edges: Sequence[Edge], sources: Sequence[str]) -> Layout:
+    layers = Layers(names, edges, sources)
+    row = _settled(layers)
+    top = min(row.values(), default=0.0)
+
+    def at(spot: Spot, column: int) -> Point:
+        return MARGIN + column * COLUMN, MARGIN + row[spot] - top
+
+    return Layout(
+        {name: at(name, layers.column[name]) for name in names},
+        {(a, b): [at(p, p[2]) for p in layers.way(a, b)] for a, b in edges if all(p in row for p in layers.way(a, b))},
+    )
 
 
-def _without_circles(names: Sequence[str], edges: Sequence[Edge], sources: Sequence[str]) -> list[Edge]:
-    """The edges without those that lead back to a node on the way (depth first, without recursion)."""
-    following: dict[str, list[str]] = {n: [] for n in names}
-    for a, b in edges:
-        following[a].append(b)
-    kept: list[Edge] = []
-    state: dict[str, int] = {}
-    for root in [*sources, *names]:
-        if root in state:
-            continue
-        state[root] = 1
-        stack = [(root, iter(following[root]))]
-        while stack:
-            node, rest = stack[-1]
-            child = next(rest, None)
-            if child is None:
-                state[node] = 2
-                stack.pop()
-            elif state.get(child) != 1:
-                kept.append((node, child))
-                if child not in state:
-                    state[child] = 1
-                    stack.append((child, iter(following[child])))
-    return kept
+def _settled(layers: Layers) -> dict[Spot, float]:
+    """Heights: every spot as level with its neighbours as its distance from those above and below it allows."""
+    row: dict[Spot, float] = {}
+    for column in layers.columns:
+        heights = [0.0]
+        for above, below in pairwise(column):
+            heights.append(heights[-1] + _apart(above, below))
+        row |= {spot: h - heights[-1] / 2 for spot, h in zip(column, heights, strict=False)}
+    for i in range(_SETTLINGS):
+        for column in layers.columns if i % 2 == 0 else layers.columns[::-1]:
+            wishes = [_wish(spot, layers, row) for spot in column]
+            row |= dict(zip(column, _spaced(column, wishes), strict=True))
+    return row
 
 
-def _longest_ways(names: Sequence[str], edges: Sequence[Edge]) -> dict[str, int]:
-    layer = dict.fromkeys(names, 0)
-    incoming = dict.fromkeys(names, 0)
-    following: dict[str, list[str]] = {n: [] for n in names}
-    for a, b in edges:
-        incoming[b] += 1
-        following[a].append(b)
-    ready = [n for n in names if not incoming[n]]
-    while ready:
-        node = ready.pop()
-        for child in following[node]:
-            layer[child] = max(layer[child], layer[node] + 1)
-            incoming[child] -= 1
-            if not incoming[child]:
-                ready.append(child)
-    return layer
+def _apart(above: Spot, below: Spot) -> float:
+    arcs = (isinstance(above, tuple)) + (isinstance(below, tuple))
+    return (ROW, _BESIDE_NODE, _BESIDE_ARC)[arcs]
 
 
-def _sweep(columns: Sequence[list[str]], neighbours: Mapping[str, Sequence[str]]) -> None:
-    """Sort each column by the mean row of its neighbours, as placed so far."""
-    row = {name: float(j) - len(column) / 2 for column in columns for j, name in enumerate(column)}
-    for column in columns:
-        column.sort(key=lambda n: sum(row[m] for m in neighbours[n]) / len(neighbours[n]) if neighbours[n] else row[n])
-        row |= {name: float(j) - len(column) / 2 for j, name in enumerate(column)}
+def _wish(spot: Spot, layers: Layers, row: Mapping[Spot, float]) -> tuple[float, float]:
+    """Where a spot would stand by its neighbours, and how much it wants that."""
+    steps = [
+        (row[n], _STRAIGHT[isinstance(spot, tuple) + isinstance(n, tuple)])
+        for n in (*layers.before[spot], *layers.next[spot])
+    ]
+    weight = sum(w for _, w in steps)
+    return (sum(y * w for y, w in steps) / weight, weight) if steps else (row[spot], 1.0)
+
+
+def _spaced(column: Sequence[Spot], wishes: Sequence[tuple[float, float]]) -> list[float]:
+    """The heights nearest to the wishes (least squares) that keep distance: pooled adjacent violators on shifted wishes."""
+    offset = [0.0]
+    for above, below in pairwise(column):
+        offset.append(offset[-1] + _apart(above, below))
+    pools: list[tuple[float, float, int]] = []  # mean, weight, size
+    for (y, w), o in zip(wishes, offset, strict=False):
+        pool = (y - o, w, 1)
+        while pools and pools[-1][0] > pool[0]:
+            mean, weight, size = pools.pop()
+            total = weight + pool[1]
+            pool = ((mean * weight + pool[0] * pool[1]) / total, total, size + pool[2])
+        pools.append(pool)
+    means = [mean for mean, _, size in pools for _ in range(size)]
+    return [mean + o for mean, o in zip(means, offset, strict=False)]
 
 
 def _mean(points: Sequence[Point]) -> Point:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from math import hypot
+from functools import partial
+from itertools import pairwise
+from math import hypot, inf
 
 from coordinator.drawing.layout import Point
-from coordinator.drawing.scene import RADIUS, Arc, Node
+from coordinator.drawing.scene import RADIUS, Arc, Node, Scene
 
 Box = tuple[float, float, float, float]
 """Left, top, right, bottom."""
@@ -15,6 +18,10 @@ Box = tuple[float, float, float, float]
 _BENDS = (0.0, 34.0, -34.0, 68.0, -68.0, 110.0, -110.0, 160.0, -160.0, 220.0, -220.0)
 _CLEARANCE = 7.0
 _SAMPLES = 24
+_LEVEL = 36.0
+_REACH = RADIUS + _CLEARANCE
+_AROUND = 80.0
+"""How far from its node a text may stand, besides its own width."""
 FONT = 12.5
 LINE = 15.0
 _CHARACTER = 0.565
@@ -22,21 +29,41 @@ _CHARACTER = 0.565
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """A quadratic curve from border to border; `bend` is how far its control point is off the straight line."""
+    """A smooth curve from border to border, drawn to its control points: a quadratic B-spline.
+
+    `bend` is how far a single control point is off the straight line.
+    """
 
     arc: Arc
     start: Point
-    control: Point
+    controls: tuple[Point, ...]
     end: Point
     bend: float
 
+    @property
+    def is_straight(self) -> bool:
+        """Whether it is a straight line."""
+        return len(self.controls) == 1 and self.bend == 0
+
+    def pieces(self, end: Point | None = None) -> list[tuple[Point, Point, Point]]:
+        """Its quadratic pieces: start, control and end of each."""
+        knots = [((a[0] + b[0]) / 2, (a[1] + b[1]) / 2) for a, b in pairwise(self.controls)]
+        return list(zip([self.start, *knots], self.controls, [*knots, end or self.end], strict=True))
+
     def point(self, s: float) -> Point:
         """The point at s, 0 at the start and 1 at the end."""
-        a, b, c = (1 - s) ** 2, 2 * s * (1 - s), s * s
-        return (
-            a * self.start[0] + b * self.control[0] + c * self.end[0],
-            a * self.start[1] + b * self.control[1] + c * self.end[1],
-        )
+        n = len(self.controls)
+        i = min(int(s * n), n - 1)
+        u = s * n - i
+        (x0, y0), (x1, y1), (x2, y2) = self.pieces()[i]
+        a, b, c = (1 - u) ** 2, 2 * u * (1 - u), u * u
+        return a * x0 + b * x1 + c * x2, a * y0 + b * y1 + c * y2
+
+    @property
+    def points(self) -> list[Point]:
+        """Points along it, near enough to each other to tell what it runs over."""
+        n = _SAMPLES + 8 * (len(self.controls) - 1)
+        return [self.point(i / n) for i in range(n + 1)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,19 +77,36 @@ class Words:
     box: Box
 
 
-def route(nodes: Mapping[str, Node], arcs: Sequence[Arc]) -> list[Way]:
-    """A way for each arc: the least bent one that passes the other nodes and the ways with the same two ends."""
+def route(scene: Scene) -> list[Way]:
+    """A way for each arc: as the layout leads it, else the least bent one that passes other nodes and ways of its two ends."""
+    arcs = scene.arcs
     pairs: dict[frozenset[str], set[float]] = {}
+    count = Counter(frozenset((a.source, a.target)) for a in arcs)
     ways: list[Way] = []
     for arc in arcs:
         key = frozenset((arc.source, arc.target))
-        twins = sum(frozenset((a.source, a.target)) == key for a in arcs) > 1
         used = pairs.setdefault(key, set())
-        best = min((_way(nodes, arc, bend) for bend in _BENDS), key=lambda w: _cost(nodes, w, used, twins))
+        best = _best(scene, arc, used, count[key] > 1)
         sense = 1.0 if arc.source < arc.target else -1.0
         used.add(best.bend * sense)
         ways.append(best)
     return ways
+
+
+def _best(scene: Scene, arc: Arc, used: set[float], twins: bool) -> Way:
+    """The way of least cost; the candidates come least bent first, so that the search ends as soon as none can be better."""
+    led = scene.through.get((arc.source, arc.target), ())
+    best, least = None, inf
+    candidates = [(0.0, partial(_led, points=led)), (0.5, partial(_led, points=led, level=_LEVEL))] if led else []
+    for cost_at_least, make in [*candidates, *((abs(bend), partial(_way, bend=bend)) for bend in _BENDS)]:
+        if best is not None and least <= cost_at_least:
+            break
+        way = make(scene.nodes, arc)
+        cost = _cost(scene.nodes, way, used, twins) + (cost_at_least if len(way.controls) > 1 else 0.0)
+        if best is None or cost < least:
+            best, least = way, cost
+    assert best is not None
+    return best
 
 
 def _way(nodes: Mapping[str, Node], arc: Arc, bend: float) -> Way:
@@ -70,7 +114,28 @@ def _way(nodes: Mapping[str, Node], arc: Arc, bend: float) -> Way:
     (x1, y1), (x2, y2) = source.at, target.at
     length = hypot(x2 - x1, y2 - y1) or 1.0
     control = ((x1 + x2) / 2 - (y2 - y1) / length * bend, (y1 + y2) / 2 + (x2 - x1) / length * bend)
-    return Way(arc, _border(source, control), control, _border(target, control), bend)
+    return Way(arc, _border(source, control), (control,), _border(target, control), bend)
+
+
+def _led(nodes: Mapping[str, Node], arc: Arc, points: Sequence[Point], level: float = 0.0) -> Way:
+    """The way by the layout's points; what lies on a line between its neighbours is left out, so that straight is straight.
+
+    With `level` it runs level for so long on both sides of each point, and cuts no corner over what stands beside it.
+    """
+    if level:
+        step = level if nodes[arc.target].at[0] > nodes[arc.source].at[0] else -level
+        points = [p for x, y in points for p in ((x - step, y), (x + step, y))]
+    kept: list[Point] = []
+    ahead = [*points[1:], nodes[arc.target].at]
+    for point, after in zip(points, ahead, strict=True):
+        x0, y0 = kept[-1] if kept else nodes[arc.source].at
+        off = (after[0] - x0) * (point[1] - y0) - (after[1] - y0) * (point[0] - x0)
+        if abs(off) > 2.0 * hypot(after[0] - x0, after[1] - y0):
+            kept.append(point)
+    if not kept:
+        return _way(nodes, arc, 0.0)
+    source, target = nodes[arc.source], nodes[arc.target]
+    return Way(arc, _border(source, kept[0]), tuple(kept), _border(target, kept[-1]), 0.0)
 
 
 def _border(node: Node, towards: Point) -> Point:
@@ -86,11 +151,15 @@ def _border(node: Node, towards: Point) -> Point:
 
 def _cost(nodes: Mapping[str, Node], way: Way, used: set[float], twins: bool) -> float:
     ends = (way.arc.source, way.arc.target)
-    points = [way.point(i / _SAMPLES) for i in range(_SAMPLES + 1)]
-    hits = sum(any(_near(node, p) for p in points) for name, node in nodes.items() if name not in ends)
+    points = way.points
+    left, right = min(x for x, _ in points) - _REACH, max(x for x, _ in points) + _REACH
+    top, bottom = min(y for _, y in points) - _REACH, max(y for _, y in points) + _REACH
+    near = [n for n in nodes.values() if left < n.at[0] < right and top < n.at[1] < bottom and n.name not in ends]
+    hits = sum(any(_near(node, p) for p in points) for node in near)
     sense = 1.0 if way.arc.source < way.arc.target else -1.0
-    taken = way.bend * sense in used or (twins and way.bend == 0.0)
-    return 1000.0 * hits + 1500.0 * taken + abs(way.bend)
+    alone = len(way.controls) == 1
+    taken = alone and (way.bend * sense in used or (twins and way.bend == 0.0))
+    return 1000.0 * hits + 1500.0 * taken + abs(way.bend) - 0.5 * (not alone)
 
 
 def _near(node: Node, p: Point) -> bool:
@@ -101,14 +170,32 @@ def _near(node: Node, p: Point) -> bool:
 def place_words(nodes: Mapping[str, Node], ways: Sequence[Way]) -> list[Words]:
     """Words beside each node where they cover least: nodes and other words count most, then arcs."""
     solid = [_around(n) for n in nodes.values()]
-    curves = [[w.point(i / _SAMPLES) for i in range(_SAMPLES + 1)] for w in ways]
+    curves = [w.points for w in ways]
     placed: list[Words] = []
     for node in sorted(nodes.values(), key=lambda n: (not n.is_place, -max(map(len, n.lines), default=0))):
-        others = [b for b in solid if b != _around(node)] + [w.box for w in placed]
+        region = _region(node)
+        others = [b for b in solid if _touch(b, region) and b != _around(node)]
+        others += [w.box for w in placed if _touch(w.box, region)]
+        near = [near for c in curves if (near := [p for p in c if _holds(region, p)])]
         spots = list(_spots(node))
-        costs = [_cover(w.box, others, curves) + 0.4 * i for i, w in enumerate(spots)]
+        costs = [_cover(w.box, others, near) + 0.4 * i for i, w in enumerate(spots)]
         placed.append(spots[costs.index(min(costs))])
     return placed
+
+
+def _region(node: Node) -> Box:
+    """Where a node's words can stand."""
+    (x, y), reach = node.at, _AROUND + max(map(text_width, node.lines), default=0.0)
+    tall = _AROUND + LINE * len(node.lines)
+    return x - reach, y - tall, x + reach, y + tall
+
+
+def _touch(a: Box, b: Box) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+
+
+def _holds(box: Box, p: Point) -> bool:
+    return box[0] < p[0] < box[2] and box[1] < p[1] < box[3]
 
 
 def badge_spot(node: Node, ways: Sequence[Way]) -> Point:

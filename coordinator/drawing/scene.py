@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from coordinator.conditions.wording import listed
+from coordinator.drawing.layers import Edge
 from coordinator.drawing.layout import Point, lay_out
 from coordinator.drawing.sheet import Sheet, sheet_of
 from coordinator.net import Marking, Net
@@ -86,6 +87,8 @@ class Scene:
     text: str
     nodes: Mapping[str, Node]
     arcs: tuple[Arc, ...] = field(default=())
+    through: Mapping[Edge, Sequence[Point]] = field(default_factory=dict)
+    """Points by which an automatic layout leads an arc, by its two ends."""
     legend: str = ""
     shown: Mapping[str, str] = field(default_factory=dict)
     """Places and transitions that are drawn as another node, the macro place around them."""
@@ -104,11 +107,19 @@ def scene_of_task(
     arcs = tuple(_joined_arcs(sheet))
     drawn: dict[str, Place | Transition] = {**sheet.places, **sheet.transitions}
     wanted = {n: _given(e.x, e.y) if n not in sheet.border else None for n, e in drawn.items()}
-    at = lay_out(wanted, [(a.source, a.target) for a in arcs], [n for n in sheet.places if sheet.tokens.get(n)])
+    layout = lay_out(wanted, [(a.source, a.target) for a in arcs], [n for n in sheet.places if sheet.tokens.get(n)])
+    at = layout.at
     nodes = {n: _place_node(sheet, p, at[n]) for n, p in sheet.places.items()}
     nodes |= {n: _transition_node(sheet, t, at, arcs) for n, t in sheet.transitions.items()}
     heading = title or (f"{task.name}: {inside}" if inside else task.name)
-    return Scene(heading, task.text or task.goal or "Petri net of a robot task", nodes, arcs, shown=_elsewhere(sheet))
+    return Scene(
+        heading,
+        task.text or task.goal or "Petri net of a robot task",
+        nodes,
+        arcs,
+        layout.through,
+        shown=_elsewhere(sheet),
+    )
 
 
 def _elsewhere(sheet: Sheet) -> dict[str, str]:
@@ -133,9 +144,10 @@ def scene_of_net(net: Net, marking: Marking | None, title: str | None) -> Scene:
         arcs += [Arc(net.places[p], name, k, "inhibitor") for p, k in net.inhibit[t]]
     tokens = marking or net.initial
     wanted: dict[str, Point | None] = dict.fromkeys((*net.places, *net.transitions))
-    at = lay_out(
+    layout = lay_out(
         wanted, [(a.source, a.target) for a in arcs], [p for p, n in zip(net.places, tokens, strict=True) if n]
     )
+    at = layout.at
     nodes = {
         p: Node(p, True, at[p], "place resource", (p,), f"place {p}", n)
         for p, n in zip(net.places, tokens, strict=True)
@@ -144,7 +156,7 @@ def scene_of_net(net: Net, marking: Marking | None, title: str | None) -> Scene:
         t: Node(t, False, at[t], "transition", (t,), f"transition {t}", upright=_upright(t, at, arcs))
         for t in net.transitions
     }
-    return Scene(title or "Petri net", net.describe(tokens), nodes, tuple(arcs))
+    return Scene(title or "Petri net", net.describe(tokens), nodes, tuple(arcs), layout.through)
 
 
 def _given(x: float | None, y: float | None) -> Point | None:

@@ -79,7 +79,7 @@ text{fill:#e6eaf0}
 
 def render(scene: Scene) -> str:
     """The scene as a complete SVG document."""
-    ways = route(scene.nodes, scene.arcs)
+    ways = route(scene)
     words = place_words(scene.nodes, ways)
     left, top, width, height = _frame(scene, ways, words)
     lines = [
@@ -167,12 +167,12 @@ def _badge(node: Node, spot: Point) -> Iterator[str]:
 
 
 def _arc(way: Way) -> Iterator[str]:
-    (x1, y1), (cx, cy), (x2, y2) = way.start, way.control, way.end
+    (x1, y1), (cx, cy), (x2, y2) = way.start, way.controls[-1], way.end
     style = " ".join(filter(None, (way.arc.kind, way.arc.style)))
     direction = atan2(y2 - cy, x2 - cx)
     reach = 9.0 if way.arc.kind == "inhibitor" else 8.0
     ex, ey = x2 - reach * cos(direction), y2 - reach * sin(direction)
-    curve = f"L{ex:.1f} {ey:.1f}" if way.bend == 0 else f"Q{cx:.1f} {cy:.1f} {ex:.1f} {ey:.1f}"
+    curve = f"L{ex:.1f} {ey:.1f}" if way.is_straight else "".join(_pieces(way, (ex, ey)))
     yield f'<path class="arc {style}" d="M{x1:.1f} {y1:.1f}{curve}"/>'
     if way.arc.kind == "inhibitor":
         bx, by = x2 - 4.5 * cos(direction), y2 - 4.5 * sin(direction)
@@ -183,6 +183,11 @@ def _arc(way: Way) -> Iterator[str]:
     yield f'<polygon class="head {style}" points="{points}"/>'
 
 
+def _pieces(way: Way, end: Point) -> Iterator[str]:
+    for (_, _), (cx, cy), (x, y) in way.pieces(end):
+        yield f"Q{cx:.1f} {cy:.1f} {x:.1f} {y:.1f}"
+
+
 def _words(words: Words) -> Iterator[str]:
     style = "" if words.node.is_place else "event"
     for i, line in enumerate(words.node.lines):
@@ -191,7 +196,7 @@ def _words(words: Words) -> Iterator[str]:
 
 def _weight(way: Way) -> Iterator[str]:
     x, y = way.point(0.5)
-    (x1, y1), (x2, y2) = way.start, way.end
+    (x1, y1), (x2, y2) = way.point(0.45), way.point(0.55)
     length = hypot(x2 - x1, y2 - y1) or 1.0
     x, y = x + (y2 - y1) / length * FONT * 0.7, y - (x2 - x1) / length * FONT * 0.7
     yield from _text(str(way.arc.weight), x, y + 4, "middle", "weight")

@@ -18,6 +18,7 @@ from tomlkit.items import Array, InlineTable, Item
 from tomlkit.toml_document import TOMLDocument
 
 LARGEST_SAFE_INTEGER = 2**53 - 1
+_BARE_END = re.compile(r"(?<!\r)\n")
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 _FAULTS = (TOMLKitError, TypeError, ValueError, KeyError, IndexError, AttributeError, RecursionError)
 
@@ -50,20 +51,27 @@ def plain(document: TOMLDocument) -> dict[str, Any]:
 
 
 def edited(text: str, wanted: Mapping[str, Any], renames: Sequence[Rename] = ()) -> str:
-    """The text after its document was made equal to `wanted`. Raises EditError."""
+    """The text after its document was made equal to `wanted`; the same bytes when it was already. Raises EditError."""
     for rename in renames:
         text = _renamed(text, rename)
     document = parse(text)
     goal = _without_none(wanted)
+    if _same(plain(document), goal):
+        return text
     try:
         _make_equal(document, goal, ())
-        result = tomlkit.dumps(document)
+        result = _lines_as_in(text, tomlkit.dumps(document))
         written = plain(parse(result))
     except _FAULTS as fault:
         raise EditError(f"the edit cannot be written as TOML: {fault}") from fault
-    if not _same(written, goal):
+    if not _same(_without_empty(written), _without_empty(goal)):
         raise EditError("this file's layout is too unusual for the edit: make it by hand")
     return result
+
+
+def _lines_as_in(text: str, result: str) -> str:
+    """The result with the line ends of a text that has one kind throughout."""
+    return _BARE_END.sub("\r\n", result) if "\r\n" in text and not _BARE_END.search(text) else result
 
 
 def _json_value(value: Any) -> Any:
@@ -86,6 +94,14 @@ def _without_none(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_without_none(v) for v in value]
     return value
+
+
+def _without_empty(document: Mapping[str, Any]) -> dict[str, Any]:
+    """The document without tables of elements that hold none: their header goes with the last of them."""
+    kept = {key: value for key, value in document.items() if value != {}}
+    if isinstance(kept.get("subnets"), Mapping):
+        kept["subnets"] = {n: _without_empty(s) if isinstance(s, Mapping) else s for n, s in kept["subnets"].items()}
+    return kept
 
 
 def _same(left: Any, right: Any) -> bool:
@@ -128,10 +144,21 @@ def _has_header(path: tuple[str, ...]) -> bool:
     return len(path) <= 2 or (path[0] == "subnets" and len(path) <= 4)
 
 
+def _is_element(path: tuple[str, ...]) -> bool:
+    """Whether a path leads to one place, transition, event or the like."""
+    return len(path) == 2 or (path[0] == "subnets" and len(path) == 4)
+
+
 def _change(table: MutableMapping[str, Any], key: str, value: Any, path: tuple[str, ...]) -> None:
     old = table[key]
     if isinstance(value, Mapping) and isinstance(old, MutableMapping):
-        _make_equal(old, value, path)
+        try:
+            _make_equal(old, value, path)
+        except _FAULTS:
+            if not _is_element(path):
+                raise
+            del table[key]  # its lines stand apart (dotted keys): this one element is written anew
+            _put(table, key, value, path)
     elif isinstance(value, list) and isinstance(old, Array):
         _change_array(old, value)
     elif isinstance(value, int) and not isinstance(value, bool) and isinstance(old, float):

@@ -58,7 +58,7 @@ def test_shipped_tasks_are_drawn_whole(path: Path, errors: bool) -> None:
 def test_words_cover_neither_nodes_nor_each_other(path: Path, errors: bool, placed: bool) -> None:
     task = load(path) if placed else unplaced(load(path))
     scene = scene_of_task(task, errors, None, None)
-    words = place_words(scene.nodes, route(scene.nodes, scene.arcs))
+    words = place_words(scene.nodes, route(scene))
     assert not [(a.node.name, b.node.name) for a, b in combinations(words, 2) if overlap(a, b)]
     for w in words:
         for node in scene.nodes.values():
@@ -118,13 +118,13 @@ def test_ordinary_net_is_drawn(task: Tasks) -> None:
 
 def test_layout_keeps_given_positions_and_fills_in_the_rest() -> None:
     wanted = {"a": (0.0, 0.0), "b": (240.0, 0.0), "t": None, "u": None, "c": (120.0, 210.0)}
-    at = lay_out(wanted, [("a", "t"), ("t", "b"), ("b", "u"), ("u", "a")], ["a"])
+    at = lay_out(wanted, [("a", "t"), ("t", "b"), ("b", "u"), ("u", "a")], ["a"]).at
     assert all(at[n] == p for n, p in wanted.items() if p is not None)
     assert len(set(at.values())) == 5
 
 
 def test_layout_goes_along_the_flow() -> None:
-    at = lay_out(dict.fromkeys("abcde"), [("a", "b"), ("b", "c"), ("c", "d"), ("d", "a"), ("b", "e")], ["a"])
+    at = lay_out(dict.fromkeys("abcde"), [("a", "b"), ("b", "c"), ("c", "d"), ("d", "a"), ("b", "e")], ["a"]).at
     assert at["a"][0] < at["b"][0] < at["c"][0] < at["d"][0] and at["e"][0] == at["c"][0] and at["e"] != at["c"]
 
 

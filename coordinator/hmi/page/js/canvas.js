@@ -1,6 +1,6 @@
 // A net view with what stands around it on every tab: zoom, search, error branches, minimap, the path of opened macros.
 
-import { fill, h, text, words } from "./dom.js";
+import { fill, h, keep, text, words } from "./dom.js";
 import { icon } from "./icons.js";
 import { Minimap } from "./minimap.js";
 import { NetView } from "./net_view.js";
@@ -68,7 +68,7 @@ export class Canvas {
       this.find();
       this.query.blur();
     }
-    event.stopPropagation();
+    keep(event);
   }
 
   goTo(name) {

@@ -33,6 +33,11 @@ export function text(element, value) {
   if (element.textContent !== wanted) element.textContent = wanted;
 }
 
+/** What is typed into a field is not meant for the drawing; what is pressed with Ctrl, such as save, still is. */
+export function keep(event) {
+  if (!event.ctrlKey && !event.metaKey) event.stopPropagation();
+}
+
 /** Replace an element's children. */
 export function fill(element, ...children) {
   element.replaceChildren(...children.flat(3).filter((child) => child !== null && child !== undefined && child !== false));

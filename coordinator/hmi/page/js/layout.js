@@ -1,21 +1,19 @@
-// Automatic layout, on demand only, by the vendored dagre.
+// Automatic layout: by the button, and for what has no position of its own.
 
-import { Graph, layout } from "../vendor/dagre/dagre.esm.js";
-import { BAR_H, PLACE_R, snap } from "./geometry.js";
+import { snap } from "./geometry.js";
+import { layered } from "./layers.js";
 
-/** Positions {name: [x, y]} for a net {places, transitions, arcs}, left to right; error branches come last in each rank. */
+let last = { key: "", positions: {} }; // a net without positions is drawn anew at each edit
+
+/** Positions {name: [x, y]} for a net {places, transitions, arcs}, left to right along the flow of tokens. */
 export function automatic(net) {
-  const graph = new Graph();
-  graph.setGraph({ rankdir: "LR", nodesep: 58, ranksep: 62, edgesep: 22, marginx: 60, marginy: 60 });
-  graph.setDefaultEdgeLabel(() => ({}));
-  for (const place of net.places) graph.setNode(place.name, { width: PLACE_R * 2 + 34, height: PLACE_R * 2 + 30 });
-  for (const transition of net.transitions) graph.setNode(transition.name, { width: 58, height: BAR_H + 36 });
-  for (const arc of net.arcs) {
-    const [from, to] = arc.direction === "out" ? [arc.transition, arc.place] : [arc.place, arc.transition];
-    if (graph.hasNode(from) && graph.hasNode(to)) graph.setEdge(from, to, { weight: arc.end === "error" ? 1 : 3 });
-  }
-  layout(graph);
-  return Object.fromEntries(graph.nodes().map((name) => [name, [snap(graph.node(name).x), snap(graph.node(name).y)]]));
+  const names = [...net.places, ...net.transitions].map((e) => e.name);
+  const known = new Set(names);
+  const edges = net.arcs.filter((a) => known.has(a.place) && known.has(a.transition)).map((a) => (a.direction === "out" ? [a.transition, a.place] : [a.place, a.transition]));
+  const sources = net.places.filter((p) => p.tokens).map((p) => p.name);
+  const key = JSON.stringify([names, edges, sources]);
+  if (last.key !== key) last = { key, positions: layered(names, edges, sources) };
+  return Object.fromEntries(Object.entries(last.positions).map(([name, [x, y]]) => [name, [snap(x), snap(y)]]));
 }
 
 /** The net with a position for every element: its own where it has one, else beside the others by automatic layout. */

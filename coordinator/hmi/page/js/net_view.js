@@ -428,7 +428,8 @@ export class NetView {
     }, { passive: false });
     this.svg.addEventListener("pointerdown", (event) => this.down(event));
     this.svg.addEventListener("dblclick", (event) => {
-      const element = this.elementAt(event.target);
+      // a press that was followed as a drag makes the whole drawing the target of its click
+      const element = this.elementAt(document.elementFromPoint(event.clientX, event.clientY) ?? event.target);
       if (element) this.events.opened?.(element, event);
     });
     this.svg.addEventListener("keydown", (event) => {

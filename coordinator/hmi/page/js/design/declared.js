@@ -1,6 +1,6 @@
 // What a task declares beside its net: events and variables, as forms of the task's own properties.
 
-import { h, words } from "../dom.js";
+import { h, keep, words } from "../dom.js";
 import { icon } from "../icons.js";
 import { toast } from "../toast.js";
 import { readValue, writeValue } from "./values.js";
@@ -13,7 +13,7 @@ const MEMORY = [["pulse", "pulse: for who is ready when it comes"], ["latched", 
 function table(form, title, key, row, fresh) {
   const { model } = form;
   const one = title.toLowerCase().replace(/s$/, "");
-  const name = h("input", { placeholder: `new ${one}`, "aria-label": `New ${one}`, onkeydown: (e) => { e.stopPropagation(); if (e.key === "Enter") add(); } });
+  const name = h("input", { placeholder: `new ${one}`, "aria-label": `New ${one}`, onkeydown: (e) => { keep(e); if (e.key === "Enter") add(); } });
   const add = () => {
     const wanted = name.value.trim().replaceAll(" ", "_");
     if (!NAME.test(wanted)) return toast("warning", "A name begins with a letter and has letters, digits and _ only.");

@@ -30,8 +30,11 @@ export class Desk {
     this.everShown = true;
     const running = this.designer.link.state.task?.name;
     const known = tasks.map((t) => t.name);
-    if (known.length) await this.open(known.includes(running) ? running : known[0]);
-    else this.designer.view.fit();
+    for (const name of known.includes(running) ? [running, ...known] : known) {
+      await this.open(name); // one that cannot be read does not keep the others closed
+      if (this.model.name) return;
+    }
+    this.designer.view.fit();
   }
 
   async refresh() {
@@ -45,10 +48,7 @@ export class Desk {
     const asked = ++this.documents;
     const task = await openTask(name);
     if (asked !== this.documents) return;
-    if (!task) {
-      this.designer.bar.paint(); // what was open stays, and so does its name
-      return;
-    }
+    if (!task) return void this.designer.bar.paint(); // what was open stays, and so does its name
     this.put(task, task.own === false);
     this.designer.findings.take(task);
     await this.refresh();

@@ -1,6 +1,6 @@
 // The form for what is chosen in the designer: an element, an arc, several elements, or the task itself.
 
-import { fill, h, words } from "../dom.js";
+import { fill, h, keep, words } from "../dom.js";
 import { icon } from "../icons.js";
 import { toast } from "../toast.js";
 import { align, distribute, layOut } from "./arrange.js";
@@ -45,7 +45,7 @@ export class Inspector {
 
   input(value, onchange, properties = {}) {
     const put = (event) => onchange(event.target.value, event);
-    return h("input", { value: value ?? "", onchange: put, onkeydown: (e) => { e.stopPropagation(); if (e.key === "Enter") e.target.blur(); if (e.key === "Escape") { e.target.value = value ?? ""; e.target.blur(); } }, spellcheck: "false", autocomplete: "off", ...properties });
+    return h("input", { value: value ?? "", onchange: put, onkeydown: (e) => { keep(e); if (e.key === "Enter") e.target.blur(); if (e.key === "Escape") { e.target.value = value ?? ""; e.target.blur(); } }, spellcheck: "false", autocomplete: "off", ...properties });
   }
 
   number(value, onchange, properties = {}) {
@@ -153,7 +153,7 @@ export class Inspector {
       onchange(next);
     };
     const names = [...new Set([...Object.keys(values), ...known])];
-    const fresh = h("input", { placeholder: "name", "aria-label": `New ${title.toLowerCase()} name`, onkeydown: (e) => e.stopPropagation() });
+    const fresh = h("input", { placeholder: "name", "aria-label": `New ${title.toLowerCase()} name`, onkeydown: keep });
     const add = () => fresh.value.trim() && onchange({ ...values, [fresh.value.trim()]: 0 });
     return h("fieldset", {}, h("legend", {}, title),
       names.map((key) => this.field(key, this.input(key in values ? writeValue(values[key]) : "", (text) => put(key, text), { placeholder: "default" }))),
@@ -205,7 +205,7 @@ export class Inspector {
   }
 
   newEvent(use) {
-    const name = h("input", { placeholder: "new event", "aria-label": "New event name", onkeydown: (e) => e.stopPropagation() });
+    const name = h("input", { placeholder: "new event", "aria-label": "New event name", onkeydown: keep });
     const scope = this.choice("external", [["external", "external"], ["internal", "internal"]], () => {}, { "aria-label": "New event scope" });
     const by = this.choice("", [["", "raised by …"], ...Object.keys(this.model.data.primitive_tasks ?? {}).map((p) => [p, words(p)])], () => {}, { "aria-label": "Raised by", hidden: true });
     scope.addEventListener("change", () => (by.hidden = scope.value !== "internal"));

@@ -39,7 +39,10 @@ export class Keys {
   withControl(event, typing) {
     const { designer } = this;
     const key = event.key.toLowerCase();
-    if (key === "s") return designer.desk.save() ?? true;
+    if (key === "s") {
+      if (typing) event.target.blur(); // what stands in the field belongs to what is saved
+      return designer.desk.save() ?? true;
+    }
     if (key === "f") return designer.canvas.query.focus() ?? true;
     if (typing) return false;
     if (STEP[event.key]) return this.nearest(...STEP[event.key]);

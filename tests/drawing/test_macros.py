@@ -1,0 +1,119 @@
+"""Macro places that group: what a task file may say of them, what it changes, and how they are drawn."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+
+import pytest
+
+from coordinator.drawing import Overlay, draw
+from coordinator.drawing.scene import scene_of_task
+from coordinator.drawing.sheet import sheet_of
+from coordinator.hmi.picture import picture
+from coordinator.task import Task
+from coordinator.taskfile import TaskFileError, dumps, loads
+
+TEXT = """
+schema = 1
+[task]
+name = "m"
+final = "done == 1"
+[places]
+begin = { kind = "control", tokens = 1 }
+inner = { kind = "macro", macro = "outer", label = "inner work" }
+outer = { kind = "macro" }
+a = { kind = "control", macro = "inner" }
+b = { kind = "control", macro = "inner", tokens = 1 }
+c = { kind = "control", macro = "outer" }
+done = { kind = "control" }
+use = { kind = "macro", subnet = "sub" }
+[transitions]
+t1 = { in = ["begin"], out = ["a", "b"] }
+t2 = { in = ["a", "b"], out = ["b"], macro = "inner" }
+t3 = { in = ["b"], out = ["c"], macro = "outer" }
+t4 = { in = ["c"], out = ["done", "use"] }
+t5 = { in = ["use:normal"], out = ["done"] }
+[subnets.sub]
+entry = "x"
+normal = "y"
+[subnets.sub.places]
+g = { kind = "macro" }
+x = { kind = "control", macro = "g" }
+y = { kind = "control" }
+[subnets.sub.transitions]
+s = { in = ["x"], out = ["y"] }
+"""
+
+
+def flat_twin() -> Task:
+    """The same task with nothing grouped."""
+    lines = [line for line in TEXT.splitlines() if not line.startswith(("inner =", "outer =", "g ="))]
+    text = "\n".join(lines)
+    for macro in ("inner", "outer", "g"):
+        text = text.replace(f', macro = "{macro}"', "")
+    return loads(text)
+
+
+def test_grouping_changes_nothing_but_the_drawing() -> None:
+    """The ordinary net, and so every analysis and every run, is that of the ungrouped task."""
+    task = loads(TEXT)
+    assert task.net == flat_twin().net
+    assert loads(dumps(task)) == task
+    assert {n: p.macro for n, p in task.flat.places.items()} == {
+        "begin": "", "a": "inner", "b": "inner", "c": "outer", "done": "", "use.x": "use.g", "use.y": "use",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "key"),
+    [
+        ('out = ["done", "use"]', 'out = ["outer"]', "transitions.t4"),
+        ('macro = "outer", label', 'macro = "inner", label', "places.inner.macro"),
+        ('t1 = { in = ["begin"]', 't1 = { macro = "inner", in = ["begin"]', "transitions.t1.macro"),
+        ('a = { kind = "control", macro = "inner"', 'a = { kind = "control", macro = "inne"', "places.a.macro"),
+        ('macro = "inner", tokens', 'macro = "use", tokens', "places.b.macro"),
+        ('outer = { kind = "macro"', 'outer = { kind = "macro", tokens = 1', "places.outer"),
+        ('"y" }', '"y" }', ""),
+    ],
+)
+def test_what_is_no_group_is_refused(old: str, new: str, key: str) -> None:
+    """Each fault names its key and a remedy."""
+    if not key:
+        loads(TEXT)
+        return
+    assert old in TEXT
+    with pytest.raises(TaskFileError) as caught:
+        loads(TEXT.replace(old, new))
+    assert [f.key for f in caught.value.faults] == [key]
+    assert caught.value.faults[0].remedy
+
+
+def test_a_macro_place_is_drawn_as_one_with_its_tokens_summed() -> None:
+    """Arcs to several places inside are one arc; the inside is drawn with what stands around it."""
+    task = loads(TEXT)
+    scene = scene_of_task(task, True, None, None)
+    assert set(scene.nodes) == {"begin", "outer", "done", "use", "t1", "t4", "t5"}
+    assert scene.nodes["outer"].tokens == 1
+    assert {(a.source, a.target): a.weight for a in scene.arcs}["t1", "outer"] == 2
+    opened = scene_of_task(task, True, None, None, "outer")
+    assert set(opened.nodes) == {"inner", "c", "t3", "t1", "t4"}
+    assert sheet_of(task, "outer", True, None).border == {"t1", "t4"}
+    assert set(scene_of_task(task, True, None, None, "use").nodes) == {"g", "y", "s"}
+    assert set(scene_of_task(task, True, None, None, "use.g").nodes) == {"x", "s"}
+    with pytest.raises(ValueError, match="no macro place 'nowhere'"):
+        draw(task, inside="nowhere")
+
+
+def test_what_is_told_of_the_inside_is_told_of_the_macro_place() -> None:
+    """Heat and turns of an overlay go to the macro place that is drawn instead."""
+    svg = draw(loads(TEXT), overlay=Overlay(heat={"a": 0.3, "use.x": 0.2}, path=["t1", "t2", "t3"]))
+    texts = [e.text for e in ElementTree.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")]
+    assert "2, 3" in texts and svg.count('class="warm"') == 2
+
+
+def test_the_page_knows_which_stands_in_which() -> None:
+    """The snapshot's picture has every macro place, with the one around it."""
+    made = picture(loads(TEXT))
+    around = {p["name"]: p["in_macro"] for p in made["places"] if p["kind"] == "macro"}
+    assert around == {"inner": "outer", "outer": "", "use": "", "use.g": "use"}
+    assert {t["name"]: t["in_macro"] for t in made["transitions"]}["use.s"] == "use"

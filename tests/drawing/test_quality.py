@@ -1,0 +1,130 @@
+"""Automatic drawings are fit to be published: measured on random nets that nobody looked at while the layout was made."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from coordinator.drawing.layout import Point
+from coordinator.drawing.routing import Box, Way, Words, place_words, route
+from coordinator.drawing.scene import Node, Scene, scene_of_net, scene_of_task
+from coordinator.task import Task
+from coordinator.taskfile import load
+from tests.drawing.conftest import random_task
+
+SHIPPED = Path(__file__).parents[2] / "coordinator" / "tasks"
+SEEDS = range(300, 316)
+
+
+def crossings(ways: list[Way]) -> int:
+    """Pairs of arcs that cross, but for those that meet at one end anyway."""
+    apart = [
+        (a, b)
+        for a, b in combinations(ways, 2)
+        if {a.arc.source, a.arc.target}.isdisjoint((b.arc.source, b.arc.target))
+    ]
+    return sum(_cross(np.array(a.points), np.array(b.points)) for a, b in apart)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> bool:
+    if (a.min(0) > b.max(0)).any() or (b.min(0) > a.max(0)).any():
+        return False
+
+    def side(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
+        return (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (r[..., 0] - p[..., 0])
+
+    a0, a1, b0, b1 = a[:-1, None], a[1:, None], b[None, :-1], b[None, 1:]
+    return bool(((side(a0, a1, b0) * side(a0, a1, b1) < 0) & (side(b0, b1, a0) * side(b0, b1, a1) < 0)).any())
+
+
+def inside(p: Point, box: Box, margin: float = 0.0) -> bool:
+    """Whether a point lies in a box."""
+    return box[0] - margin < p[0] < box[2] + margin and box[1] - margin < p[1] < box[3] + margin
+
+
+def box_of(node: Node) -> Box:
+    """What a node covers."""
+    (x, y), (w, h) = node.at, node.half
+    return x - w, y - h, x + w, y + h
+
+
+def covers(a: Box, b: Box) -> bool:
+    """Whether two boxes overlap."""
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+
+
+def through_nodes(scene: Scene, ways: list[Way]) -> Iterator[tuple[Way, str]]:
+    """Arcs that run over a node that is not theirs."""
+    for way in ways:
+        for node in scene.nodes.values():
+            if node.name not in (way.arc.source, way.arc.target) and any(
+                inside(p, box_of(node), 1.0) for p in way.points
+            ):
+                yield way, node.name
+
+
+def through_words(words: list[Words], ways: list[Way]) -> int:
+    """Texts with an arc through their middle, where it would be read through."""
+    cores = [(w.box[0], w.box[1] + 4, w.box[2], w.box[3] - 4) for w in words]
+    return sum(any(inside(p, core) for p in way.points) for core in cores for way in ways)
+
+
+def drawn(scene: Scene) -> tuple[list[Way], list[Words]]:
+    """Its arcs and words."""
+    ways = route(scene)
+    return ways, place_words(scene.nodes, ways)
+
+
+def test_random_nets_are_drawn_as_a_person_would() -> None:
+    """No node on another, no arc over a node, no word on a word or node; crossings and struck words are rare (all seeds)."""
+    arcs = crossed = struck = 0
+    for seed in SEEDS:
+        scene = scene_of_net(random_task(np.random.default_rng(seed), 2 + seed % 3), None, None)
+        ways, words = drawn(scene)
+        boxes = [box_of(n) for n in scene.nodes.values()]
+        assert not any(covers(a, b) for a, b in combinations(boxes, 2))
+        assert not list(through_nodes(scene, ways))
+        assert not any(covers(a.box, b.box) for a, b in combinations(words, 2))
+        assert not any(covers(w.box, box) for w in words for box in boxes)
+        arcs, crossed, struck = arcs + len(ways), crossed + crossings(ways), struck + through_words(words, ways)
+    assert arcs > 300
+    assert crossed <= 0.01 * arcs
+    assert struck <= 0.01 * arcs
+
+
+def unplaced(task: Task) -> Task:
+    """The task without positions."""
+    places = {n: replace(p, x=None, y=None) for n, p in task.places.items()}
+    return replace(
+        task, places=places, transitions={n: replace(t, x=None, y=None) for n, t in task.transitions.items()}
+    )
+
+
+@pytest.mark.parametrize("errors", [False, True])
+@pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.toml")), ids=lambda p: p.stem)
+def test_shipped_tasks_could_do_without_positions(path: Path, errors: bool) -> None:
+    """Laid out automatically no arc runs over a node, and no more arcs cross or strike words than where people put things."""
+    task = load(path)
+    by_hand = drawn(scene_of_task(task, errors, None, None))
+    scene = scene_of_task(unplaced(task), errors, None, None)
+    ways, words = drawn(scene)
+    assert not list(through_nodes(scene, ways))
+    assert crossings(ways) <= crossings(by_hand[0])
+    assert through_words(words, ways) <= through_words(by_hand[1], by_hand[0])
+
+
+def test_a_long_way_back_is_led_around() -> None:
+    """An arc over several columns runs by the layout's points, smoothly, from border to border."""
+    scene = scene_of_net(random_task(np.random.default_rng(1), 3), None, None)
+    ways = route(scene)
+    led = [w for w in ways if len(w.controls) > 1]
+    assert led
+    for way in led:
+        steps = np.diff(np.array(way.points), axis=0)
+        assert np.hypot(*steps.T).max() < 60
+        assert way.points[0] == pytest.approx(way.start) and way.points[-1] == pytest.approx(way.end)
