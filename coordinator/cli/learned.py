@@ -28,7 +28,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--context", metavar="TEXT", help="show: only this context (default: all, as scenarios)")
     parser.add_argument(
-        "--cost", default="wall", metavar="MEASURE", help="wall, cpu, count or value:NAME (default: wall)"
+        "--cost",
+        metavar="MEASURE",
+        help="wall, cpu, count or value:NAME (default: what the task declares and was learned by, else wall)",
     )
     parser.add_argument(
         "--target", type=float, metavar="R", help="target reliability: which scenarios and actions meet it"
@@ -102,19 +104,25 @@ def _show(kept: Kept, options: argparse.Namespace) -> int:
     from coordinator.learning.objective import Question, compare
 
     try:
-        question = Question(options.cost, options.target, options.rho)
         shown = {}
         for task in options.more or _tasks(kept):
+            question = Question(_measure(kept, task, options), options.target, options.rho)
             tallies = kept.estimates.of(task, options.context)
             shown[task] = _plain(kept, task, compare(tallies, question), options)
     except ValueError as fault:
         raise CommandError(2, str(fault)) from fault
     if options.json:
-        write_json(options.json, {"file": str(options.file), "cost": options.cost, "primitive_tasks": shown})
+        write_json(options.json, {"file": str(options.file), "primitive_tasks": shown})
     if options.json != "-":
         for task, about in shown.items():
             _print(task, about, options)
     return 0
+
+
+def _measure(kept: Kept, task: str, options: argparse.Namespace) -> str:
+    """The cost measure: as given, else the one by which the primitive task was learned."""
+    known = (state.get("cost") for (of, _), state in kept.selectors.items() if of == task)
+    return str(options.cost or next((measure for measure in known if measure), "wall"))
 
 
 def _plain(kept: Kept, task: str, judged: Comparison, options: argparse.Namespace) -> dict[str, Any]:
@@ -124,7 +132,12 @@ def _plain(kept: Kept, task: str, judged: Comparison, options: argparse.Namespac
     front = {f.action for f in pareto(judged.figures)}
     for row in rows:
         row["pareto"] = row["action"] in front
-    about: dict[str, Any] = {"rho": judged.rho, "best": judged.best, "actions": rows}
+    about: dict[str, Any] = {
+        "cost": _measure(kept, task, options),
+        "rho": judged.rho,
+        "best": judged.best,
+        "actions": rows,
+    }
     about["break_even"] = _break_even(judged)
     if options.target is not None:
         about["to_reach"] = _answer(cost_to_reach(judged.figures, options.target))
@@ -151,7 +164,7 @@ def _row(kept: Kept, task: str, f: Figures, options: argparse.Namespace) -> dict
 
     by_context = kept.estimates.of(task, options.context)[f.action]
     whole = reduce(merge, by_context.values(), Tally())
-    cost = whole.cost(options.cost)
+    cost = whole.cost(_measure(kept, task, options))
     return {
         "action": f.action,
         "runs": f.runs,
@@ -211,7 +224,10 @@ def _print(task: str, about: dict[str, Any], options: argparse.Namespace) -> Non
 
     console = Console()
     table = Table(
-        title=f"{task} (rho {about['rho']:.4g})", title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)
+        title=f"{task} (C: {about['cost']}, rho {about['rho']:.4g})",
+        title_justify="left",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
     )
     table.show_edge = table.pad_edge = False
     always_there = all(row["A"] == 1.0 for row in about["actions"])

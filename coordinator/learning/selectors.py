@@ -206,6 +206,7 @@ class RuleSelector:
             "selector": self.name,
             "actions": list(self.actions),
             "frozen": self.frozen,
+            "cost": self.question.measure,
             "learners": {context: batch.to_plain() for context, batch in sorted(self.learners.items())},
         }
 

@@ -99,6 +99,25 @@ def test_learning_goes_on_where_it_stood(cell: Path, capsys: pytest.CaptureFixtu
     assert "nikolic_fu_fast regime=A" in capsys.readouterr().out.replace("\n", " ")
 
 
+def test_costs_are_shown_as_they_were_learned_by(cell: Path) -> None:
+    """The measure that the task declares for each primitive task, and in its unit; `--cost` asks otherwise."""
+    petrobot("--learn", "learned.db", runs=12)
+
+    def shown(*more: str) -> dict[str, Any]:
+        assert main(["learned", "show", "learned.db", "--json", "shown.json", *more]) == 0
+        found: dict[str, Any] = json.loads(Path("shown.json").read_text(encoding="utf-8"))["primitive_tasks"]
+        return found
+
+    declared = shown()
+    assert {task: about["cost"] for task, about in declared.items()} == {"pick": "wall", "place": "value:tries"}
+    place = EstimatesFile(cell / "learned.db").read().estimates.of("place")
+    for row in declared["place"]["actions"]:
+        (tally,) = place[row["action"]].values()
+        assert row["C"] == pytest.approx(tally.cost("value:tries").mean)
+    counted = shown("--cost", "count")
+    assert all(row["C"] == 1.0 for about in counted.values() for row in about["actions"] if row["runs"])
+
+
 def test_it_learns_the_only_way_that_works(cell: Path) -> None:
     """Of three ways to pick, one succeeds: after 150 runs it has nearly all probability, and frozen it is always chosen."""
     _, result = petrobot("--learn", "learned.db", runs=150)
