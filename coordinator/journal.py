@@ -3,8 +3,8 @@
 Format 1. The file starts with the eight bytes `MAGIC`. Each record is a little-endian u32 length, a u32 CRC-32 of the
 payload, and the payload, a msgpack array `[number, kind, data]`. Record 0 is the header (kind "header"): texts of task
 file and services.toml, versions, seed. Numbers count up by one. A file that ends inside a record, or whose last record
-fails its checksum, was torn by a crash: the tail is dropped and reported. A record that fails its checksum with others
-behind it is damage, not a crash, and is refused.
+fails its checksum, was torn by a crash: the tail is dropped and reported (also one of zeros, which a file system may leave after a
+power cut). One that cannot be read with whole records behind it is damage, not a crash, and is refused.
 
 Kinds of a mission run's journal: coordinator/recording.py. Why not SQLite: docs/decisions/journal.md has the measurement.
 """
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import re
 import struct
 import zlib
 from collections.abc import Mapping
@@ -22,10 +23,12 @@ from typing import Any
 
 import msgpack
 
-MAGIC = b"PETROJ1\n"
 FORMAT = 1
+MAGIC = b"PETROJ%d\n" % FORMAT
+_FAMILY = re.compile(rb"PETROJ(\d+)\n")
 PREFIX = struct.Struct("<II")
-LARGEST_RECORD = 1 << 24
+SMALLEST_RECORD, LARGEST_RECORD = 4, 1 << 24
+_ARRAY_OF_THREE = 0x93
 
 
 class JournalError(Exception):
@@ -61,6 +64,8 @@ class JournalWriter:
         self._buffer = bytearray()
         self._unsynced = False
         """Whether records were handed to the operating system since the last sync."""
+        self._torn: int | None = None
+        """Where the file is to be cut before anything is appended; None: nowhere."""
         self.syncs = 0
         if header is not None:
             try:
@@ -78,11 +83,24 @@ class JournalWriter:
             self.sync()
             _sync_folder(path.parent)
         else:
+            self.found = self._go_on(path)
+            self.next_number = len(self.found.records) + 1
+            self._torn = self.found.good_bytes if self.found.torn_bytes else None
+
+    def _go_on(self, path: Path) -> Journal:
+        """Be the writer of an existing journal, and read it as it is from now on; it stays as it is until something is appended."""
+        try:
             self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC)
-            self._take(path)
-            journal = read_journal(path)
-            os.ftruncate(self._file, journal.good_bytes)
-            self.next_number = len(journal.records) + 1
+        except OSError as fault:
+            raise JournalError(
+                f"{path}: {fault.strerror}; it can be gone on with only where it can be written"
+            ) from fault
+        self._take(path)
+        try:
+            return read_journal(path)
+        except BaseException:
+            os.close(self._file)
+            raise
 
     def _take(self, path: Path) -> None:
         """Be the only writer for as long as this process lives: a run that goes on cannot be resumed beside itself."""
@@ -118,15 +136,14 @@ class JournalWriter:
         if not self._buffer:
             return
         self._unsynced = True
-        view = memoryview(self._buffer)
         try:
-            while view:
-                view = view[os.write(self._file, view) :]
+            if self._torn is not None:
+                os.ftruncate(self._file, self._torn)
+                self._torn = None
+            while self._buffer:  # what a full disk has taken of it stays taken: another try goes on behind that
+                del self._buffer[: os.write(self._file, self._buffer)]
         except OSError as fault:
             raise JournalError(f"{self.path}: {fault.strerror}; nothing was sent on the strength of it") from fault
-        finally:
-            view.release()
-        self._buffer.clear()
 
     def sync(self) -> None:
         """Make all that was appended durable; costs nothing if it is already."""
@@ -140,9 +157,11 @@ class JournalWriter:
             self._unsynced = False
 
     def close(self) -> None:
-        """Sync and close."""
-        self.sync()
-        os.close(self._file)
+        """Sync and close; closed it is in any case."""
+        try:
+            self.sync()
+        finally:
+            os.close(self._file)
 
 
 def _sync_folder(folder: Path) -> None:
@@ -157,31 +176,57 @@ def read_journal(path: Path) -> Journal:
     """Read a journal; a torn tail is dropped and counted. Raises JournalError for anything worse, OSError if unreadable."""
     raw = path.read_bytes()
     if not raw.startswith(MAGIC):
-        raise JournalError(
-            f"{path}: not a journal of format {FORMAT}; it was written by another version or is no journal"
-        )
+        raise JournalError(f"{path}: {_foreign(raw)}")
     records: list[Record] = []
     offset = len(MAGIC)
-    while (end := _record_end(raw, offset)) is not None:
-        payload = raw[offset + PREFIX.size : end]
-        if zlib.crc32(payload) != PREFIX.unpack_from(raw, offset)[1]:
-            if end < len(raw):
-                raise JournalError(
-                    f"{path}: record {len(records)} at byte {offset} is damaged; restore the file from a copy"
-                )
-            break
+    while (payload := _payload(raw, offset)) is not None:
         records.append(_record(path, payload, len(records)))
-        offset = end
+        offset += PREFIX.size + len(payload)
+    if (behind := _next_record(raw, offset + 1, len(records))) is not None:
+        text = f"record {len(records)} at byte {offset} is damaged: record {behind} behind it is whole"
+        raise JournalError(f"{path}: {text}; restore the file from a copy")
     if not records:
         raise JournalError(f"{path}: ends inside its header; the run had not begun")
+    written = records[0].data.get("format", FORMAT)
+    if written != FORMAT:
+        raise JournalError(f"{path}: {_other_format(written)}")
     return Journal(path, records[0].data, tuple(records[1:]), len(raw) - offset, offset)
 
 
-def _record_end(raw: bytes, offset: int) -> int | None:
+def _foreign(raw: bytes) -> str:
+    """What a file is that does not begin as a journal of ours does."""
+    known = _FAMILY.match(raw)
+    if known is None:
+        return "no journal of a mission run"
+    return _other_format(int(known[1]))
+
+
+def _other_format(written: object) -> str:
+    remedy = "a newer petrobot" if isinstance(written, int) and written > FORMAT else "the petrobot that wrote it"
+    return f"a journal of format {written}, and this petrobot reads format {FORMAT}; use {remedy}"
+
+
+def _payload(raw: bytes, offset: int) -> bytes | None:
+    """The payload of the record that begins there; None if none does that is whole."""
     if offset + PREFIX.size > len(raw):
         return None
-    end = offset + PREFIX.size + PREFIX.unpack_from(raw, offset)[0]
-    return int(end) if end <= len(raw) else None
+    length, checksum = PREFIX.unpack_from(raw, offset)
+    begin = offset + PREFIX.size
+    if not SMALLEST_RECORD <= length <= min(LARGEST_RECORD, len(raw) - begin):
+        return None
+    payload = raw[begin : begin + length]
+    return payload if zlib.crc32(payload) == checksum else None
+
+
+def _next_record(raw: bytes, offset: int, after: int) -> int | None:
+    """Number of the first whole record from there on that comes after record `after`, None if there is none."""
+    for begin in range(offset, len(raw) - PREFIX.size):
+        payload = _payload(raw, begin)
+        if payload is not None and payload[0] == _ARRAY_OF_THREE:
+            number = msgpack.unpackb(payload, raw=False, strict_map_key=False)[0]
+            if number > after:
+                return int(number)
+    return None
 
 
 def _record(path: Path, payload: bytes, expected: int) -> Record:

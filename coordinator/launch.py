@@ -170,10 +170,15 @@ def resumed_mission(
     """
     header = journal.header
     writer = JournalWriter(journal.path)
+    journal = writer.found  # as it is now that nobody else can write it
     epoch = last_epoch(journal) + 1
-    writer.append(EPOCH, {"epoch": epoch})
-    writer.sync()
-    steps = list(replay(journal, engine))
+    try:
+        steps = list(replay(journal, engine))
+        writer.append(EPOCH, {"epoch": epoch})
+        writer.sync()
+    except BaseException:
+        writer.close()
+        raise
     origin = origin_of(header, now, steps[-1].time if steps else 0.0)
     name = NAME if header["mode"] == "lockstep" else header["mission"]
     callers = make_callers(directory, secrets.token_hex(8), epoch, name)

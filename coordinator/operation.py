@@ -30,6 +30,7 @@ from coordinator.engine import (
 )
 from coordinator.hmi.feed import Feed
 from coordinator.hmi.narrator import Narrator
+from coordinator.journal import JournalError
 from coordinator.mission import Mission, Stage
 from coordinator.partners import FirstAlternative
 from coordinator.realtime import credentials_of
@@ -57,6 +58,9 @@ class Shell(Protocol):
 
     def flush(self, node: str) -> None:
         """Send what was said to a node."""
+
+    def fail(self, fault: Exception) -> None:
+        """The run cannot go on: it ends with this fault, and nothing more leaves."""
 
 
 class Operation:
@@ -211,8 +215,12 @@ class Operation:
         if self.mission.stage is not Stage.RUNNING and not early:
             return refusal("idle", f"the mission run is {self.mission.stage.value}")
         self._refusals.clear()
-        self.executor.stimulate(self.shell.now(), stimulus)
-        self.executor.store.sync()
+        try:
+            self.executor.stimulate(self.shell.now(), stimulus)
+            self.executor.store.sync()
+        except JournalError as fault:
+            self.shell.fail(fault)
+            return refusal("journal", str(fault))
         self.shell.settle()
         return refusal("refused", self._refusals[0]) if self._refusals else {"ok": True}
 

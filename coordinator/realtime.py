@@ -92,6 +92,11 @@ class RealtimeMission:
         """Send what was said to a node."""
         self.clients[node].flush(self.now())
 
+    def fail(self, fault: BaseException) -> None:
+        """End with this fault; nothing more leaves."""
+        self._fault = self._fault or fault
+        self._over.set()
+
     def settle(self) -> None:
         """Send what was said, and wake up in time for what is due next; call it after each use of the mission."""
         if self._closed:
@@ -126,8 +131,7 @@ class RealtimeMission:
             step(self._loop.time())
         except (MissionError, JournalError) as fault:
             # What is not safe has not left: the nodes end its runs as orphans, and `resume` goes on from what is.
-            self._fault = fault
-            self._over.set()
+            self.fail(fault)
             return
         self._loop.call_soon(self.settle)
 

@@ -49,6 +49,7 @@ class SimulatedShell:
         self._party = party
         self._pace = pace
         self._wake = asyncio.Event()
+        self._fault: Exception | None = None
 
     def now(self) -> float:
         """Simulated time (s)."""
@@ -61,6 +62,11 @@ class SimulatedShell:
     def flush(self, node: str) -> None:
         """What was said to a node leaves with the next tick."""
 
+    def fail(self, fault: Exception) -> None:
+        """`run` raises this fault at its next look."""
+        self._fault = fault
+        self._wake.set()
+
     @property
     def still(self) -> bool:
         """Whether time stands still: the net is paused and nobody is to answer any more."""
@@ -72,6 +78,8 @@ class SimulatedShell:
         told = begun = time.perf_counter()
         behind = 0.0  # wall time that does not count for the pace
         while not self._party.over:
+            if self._fault is not None:
+                raise self._fault
             if self.still:
                 behind -= time.perf_counter()
                 self._wake.clear()

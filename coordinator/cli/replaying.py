@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from services.comm.directory import Directory
 
 
+HEADER = ("mission", "mode", "task", "services", "services_path", "seed", "runs", "parameters")
+"""What a header must say for its run to be derived again."""
+
+
 @dataclass(frozen=True, slots=True)
 class Recorded:
     """A recorded mission run and what it ran with."""
@@ -46,6 +50,9 @@ def recorded(name: str) -> Recorded:
     try:
         journal = read_journal(journal_of(name))
         header = journal.header
+        for key in HEADER:
+            if key not in header:
+                raise CommandError(2, f"{journal.path}: its header has no {key!r}; it is no journal of a mission run")
         task, _ = with_runs(loads(header["task"], f"{journal.path} (task)"), header["runs"])
         directory = parse(header["services"], Path(header["services_path"]))
     except (NoRunError, JournalError, TaskFileError, DirectoryError) as fault:
