@@ -7,6 +7,7 @@ into an estimates file; and, in lock step, a point of a recorded run to set out 
 from __future__ import annotations
 
 import re
+import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,11 +27,13 @@ from services.comm.directory import Directory
 REALTIME, LOCKSTEP = "realtime", "lockstep"
 MODES: Final = (REALTIME, LOCKSTEP)
 SEED: Final = 1
+LONGEST_TEXT: Final = 10_000
 MOST_RUNS: Final = 1_000_000
 LARGEST_SEED: Final = 2**63 - 1
 SUFFIX: Final = ".db"
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,63}")
 _KINDS: Final = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
+_SHORT: Final = reprlib.Repr()
 _KNOWN: Final = frozenset({"task", "mode", "runs", "seed", "regime", "parameters", "learn", "pace", "from"})
 
 
@@ -82,7 +85,7 @@ def read_start(task: Task, data: Mapping[str, Any], estimates: Path) -> StartOrd
     _refuse_unknown(data)
     mode = data.get("mode") or REALTIME
     if mode not in MODES:
-        raise ValueError(f"mode: {mode!r} is none of {', '.join(MODES)}")
+        raise ValueError(f"mode: {_shown(mode)} is none of {', '.join(MODES)}")
     runs = data.get("runs")
     if runs is not None:
         if not task.runs_place:
@@ -115,7 +118,7 @@ def read_depart(task: Task, data: Mapping[str, Any]) -> DepartOrder:
     if isinstance(going, Mapping):
         going = {str(place): str(word) for place, word in going.items()}
     elif not isinstance(going, str):
-        raise ValueError(f"from.going: {going!r} is no word and no object of words by place")
+        raise ValueError(f"from.going: {_shown(going)} is no word and no object of words by place")
     seed = None if data.get("seed") is None else _whole("seed", data["seed"], 0, LARGEST_SEED)
     record = _whole("from.record", source.get("record", 0), 0, 2**53)
     return DepartOrder(
@@ -128,12 +131,16 @@ def read_parameters(task: Task, given: Mapping[str, Any]) -> dict[str, Any]:
     made = {}
     for name, value in given.items():
         if name not in task.parameters:
-            raise ValueError(f"{task.name} has no parameter {name!r}; it has: {', '.join(task.parameters) or 'none'}")
+            raise ValueError(
+                f"{task.name} has no parameter {_shown(name)}; it has: {', '.join(task.parameters) or 'none'}"
+            )
         kind = type(task.parameters[name])
         if kind is float and type(value) is int:
             value = float(value)
         if type(value) is not kind or (kind is float and value - value != 0):
-            raise ValueError(f"parameter {name}: {value!r} is not {_KINDS[kind]}")
+            raise ValueError(f"parameter {name}: {_shown(value)} is not {_KINDS[kind]}")
+        if kind is str and not _is_text(value):
+            raise ValueError(f"parameter {name}: {_shown(value)} is no text of Unicode")
         made[name] = value
     return made
 
@@ -175,12 +182,25 @@ def start_form(task: Task, text: str, estimates: Path) -> dict[str, Any]:
 def _refuse_unknown(data: Mapping[str, Any]) -> None:
     unknown = sorted(set(data) - _KNOWN)
     if unknown:
-        raise ValueError(f"start knows no {', '.join(map(repr, unknown))}; it knows {', '.join(sorted(_KNOWN))}")
+        raise ValueError(f"start knows no {', '.join(map(_shown, unknown[:8]))}; it knows {', '.join(sorted(_KNOWN))}")
+
+
+def _shown(value: Any) -> str:
+    """A value for a refusal: what came from outside is cut, however long or deep it is."""
+    return _SHORT.repr(value)
+
+
+def _is_text(value: str) -> bool:
+    try:
+        value.encode()
+    except UnicodeEncodeError:
+        return False
+    return len(value) <= LONGEST_TEXT
 
 
 def _whole(name: str, value: Any, least: int, most: int) -> int:
     if type(value) is not int or not least <= value <= most:
-        raise ValueError(f"{name}: {value!r} is no whole number from {least} to {most}")
+        raise ValueError(f"{name}: {_shown(value)} is no whole number from {least} to {most}")
     return value
 
 
@@ -188,14 +208,14 @@ def _pace(value: Any) -> float:
     if value is None:
         return 1.0
     if type(value) not in (int, float) or not 0 <= value <= 1000:
-        raise ValueError(f"pace: {value!r} is no number from 0 (as fast as it goes) to 1000 times real time")
+        raise ValueError(f"pace: {_shown(value)} is no number from 0 (as fast as it goes) to 1000 times real time")
     return float(value)
 
 
 def _with_regime(data: Mapping[str, Any]) -> dict[str, Any]:
     given = data.get("parameters") or {}
     if not isinstance(given, Mapping):
-        raise ValueError(f"parameters: {given!r} is no object of values by name")
+        raise ValueError(f"parameters: {_shown(given)} is no object of values by name")
     return {str(k): v for k, v in given.items()} | ({} if data.get("regime") is None else {"regime": data["regime"]})
 
 
@@ -205,17 +225,17 @@ def _learn(given: Any, folder: Path) -> Learn:
     name, selector = given.get("file"), given.get("selector") or DEFAULT
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise ValueError(
-            f"learn.file: {name!r} is no name of letters, digits, _ and -, 64 at most; it is kept in {folder}"
+            f"learn.file: {_shown(name)} is no name of letters, digits, _ and -, 64 at most; it is kept in {folder}"
         )
     if selector not in RULES:
-        raise ValueError(f"learn.selector: {selector!r} is none of {', '.join(RULES)}")
+        raise ValueError(f"learn.selector: {_shown(selector)} is none of {', '.join(RULES)}")
     target, contexts, frozen = given.get("target"), given.get("contexts"), given.get("frozen", False)
     if target is not None and (type(target) not in (int, float) or not 0 < target <= 1):
-        raise ValueError(f"learn.target: {target!r} is no reliability above 0 and at most 1")
+        raise ValueError(f"learn.target: {_shown(target)} is no reliability above 0 and at most 1")
     if contexts is not None and not (isinstance(contexts, list) and all(isinstance(c, str) for c in contexts)):
         raise ValueError("learn.contexts: a list of names or conditions is needed")
     if type(frozen) is not bool:
-        raise ValueError(f"learn.frozen: {frozen!r} is neither true nor false")
+        raise ValueError(f"learn.frozen: {_shown(frozen)} is neither true nor false")
     parts = None if contexts is None else tuple(c for c in contexts if c.strip())
     return Learn(folder / f"{name}{SUFFIX}", selector, None if target is None else float(target), parts, frozen)
 

@@ -33,7 +33,11 @@ async def read_object(request: web.Request) -> dict[str, Any]:
 
 def json_answer(value: Mapping[str, Any] | Sequence[Any], status: int = 200) -> web.Response:
     """An answer that no cache keeps."""
-    text = json.dumps(value, default=str, ensure_ascii=False)
+    body = json.dumps(value, default=str, ensure_ascii=False).encode("utf-8", "replace")  # a lone surrogate is no text
     return web.Response(
-        text=text, status=status, content_type="application/json", headers={"Cache-Control": "no-store"}
+        body=body,
+        status=status,
+        content_type="application/json",
+        charset="utf-8",
+        headers={"Cache-Control": "no-store"},
     )

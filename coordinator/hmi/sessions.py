@@ -7,6 +7,7 @@ import contextlib
 import hashlib
 import json
 import re
+from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -15,6 +16,7 @@ from aiohttp import WSCloseCode, WSMsgType, web
 from coordinator.hmi.changes import Pending
 from coordinator.hmi.port import PROTOCOL, VERBS, MissionPort
 
+LONGEST_FAULT = 400
 SEND_S = 8.0
 """A client that takes nothing for so long is closed; it comes back by itself."""
 HELLO_S = 5.0
@@ -22,6 +24,8 @@ ALIVE_S = 1.0
 PACE_S = 0.012
 """Pause between two deltas to one client: no screen shows more."""
 COMMANDS_AT_ONCE = 8
+NUMBERS_KEPT = 256
+"""So many numbers of commands are remembered: none is carried out twice."""
 MESSAGES_PER_S = 60
 LARGEST_MESSAGE = 256 * 1024
 LARGEST_SNAPSHOT = 64 * 1024 * 1024
@@ -60,6 +64,7 @@ class Session:
         self._news = asyncio.Event()
         self._answers: list[dict[str, Any]] = []
         self._commands = 0
+        self._numbers: deque[int] = deque(maxlen=NUMBERS_KEPT)
         self._budget = float(MESSAGES_PER_S)
         self._budget_at = asyncio.get_running_loop().time()
         self.who = ""
@@ -132,6 +137,10 @@ class Session:
         number, verb, data = message.get("id"), message.get("verb"), message.get("data", {})
         if not isinstance(number, int) or not isinstance(data, dict):
             raise ProtocolError("a command has a whole number as id and an object as data")
+        if number in self._numbers:
+            self._answer(number, {"ok": False, "code": "replayed", "text": f"command {number} was given before"})
+            return
+        self._numbers.append(number)
         if verb != "estop" and self._commands >= COMMANDS_AT_ONCE:
             self._answer(number, {"ok": False, "code": "busy", "text": "wait for the answers to earlier commands"})
             return
@@ -196,11 +205,15 @@ class Session:
 async def carry_out(port: MissionPort, who: str, verb: str, data: Mapping[str, Any]) -> dict[str, Any]:
     """One command to the mission; whatever goes wrong there becomes an answer, so that no command goes unanswered."""
     if verb not in VERBS:
-        return {"ok": False, "code": "unknown_command", "text": f"no command {verb!r}"}
+        return {"ok": False, "code": "unknown_command", "text": f"no command {verb[:40]!r}"}
     try:
         return await port.command(who, verb, data)
     except Exception as fault:
-        return {"ok": False, "code": "fault", "text": f"{verb} failed: {type(fault).__name__}: {fault}"}
+        return {
+            "ok": False,
+            "code": "fault",
+            "text": f"{verb} failed: {type(fault).__name__}: {str(fault)[:LONGEST_FAULT]}",
+        }
 
 
 def _plain(message: Any) -> dict[str, Any]:
