@@ -29,6 +29,8 @@ class CoordinatorParty:
         self._watch = watch
         self._begin = begin or mission.start
         self._now = 0.0
+        self._nodes: dict[str, str] = {}
+        """By endpoint, as far as it was heard of: its node."""
         for caller in mission.callers.values():
             caller.open(0.0)
 
@@ -40,7 +42,9 @@ class CoordinatorParty:
     def receive(self, now: float, envelope: Envelope) -> None:
         """Take a node's message, and what comes of it at once: so the order of arrival counts, not that of the nodes."""
         self._now = now
-        node = self._directory.party(envelope.source)
+        node = self._nodes.get(envelope.source)
+        if node is None:
+            node = self._nodes[envelope.source] = self._directory.party(envelope.source)
         caller = self.mission.callers[node]
         if not caller.up and not isinstance(envelope.body, Welcome | Refuse):
             return  # meant for a predecessor of this process: its connection is gone, and what was on its way with it

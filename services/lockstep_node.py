@@ -33,6 +33,10 @@ class LockstepNode:
         self._now = 0.0
         self._out: list[Envelope] = []
         self._ports: dict[str, LockstepPorts] = {}
+        self._heard = True
+        """Whether a message has come since the last tick."""
+        self._parties: dict[str, str] = {}
+        """By endpoint, as far as it was asked: the party that it lives in."""
         self._ends: dict[str, tuple[str, str]] = {}
         """By call id: the endpoint that calls, and the one that is called."""
         devices = [d for d in directory.devices.values() if d.node == name]
@@ -67,6 +71,7 @@ class LockstepNode:
         """Take an envelope that is due."""
         self._now = now
         if envelope.channel == "call":
+            self._heard = True
             self._receive_message(now, envelope, envelope.body)
         elif envelope.target in self._ports:
             self._ports[envelope.target].receive(envelope)
@@ -74,23 +79,41 @@ class LockstepNode:
     def advance(self, now: float) -> None:
         """Do all that is due."""
         self._now = now
-        self.node.advance(now)
+        news = self._advance_node(now)
         for device, ports in self._ports.items():
             ports.flush()
             for name, data in ports.raised():
                 self.node.callee.raise_event(now, name, data, source=device, latched=True)
+                news = True
+        if news:
+            self._send_set_points()
+            self._send_messages(now)
+
+    def _advance_node(self, now: float) -> bool:
+        """Let the node do all that is due; says whether anything may have come of it. In most ticks no message has come, and the
+        ends of calls need not be looked at."""
+        node = self.node
+        if self._heard or not node.ends_quiet(now):
+            self._heard = False
+            node.advance(now)
+            return True
+        news = node.advance_places(now)
+        if news:
+            node.settle(now)
+        return news
+
+    def _send_set_points(self) -> None:
         for action, sent in self.node.sent:
             stream = self._directory.streams[sent.stream]
             body = set_point_body(sent.stream, sent.values, sent.elapsed, stream.period)
             self._out.append(Envelope(self._directory.where(sent.stream), action, stream.to, "stream", body))
         self.node.sent.clear()
-        self._send_messages(now)
 
     def drain(self) -> Sequence[Envelope]:
         """What was sent since the last call, in order."""
         if not self._out:
             return ()
-        out = list(self._out)
+        out = self._out[:]
         self._out.clear()
         return out
 
@@ -101,7 +124,9 @@ class LockstepNode:
     # --- messages ----------------------------------------------------------------------------------------------------
 
     def _receive_message(self, now: float, envelope: Envelope, message: Message) -> None:
-        peer = self._directory.party(envelope.source)
+        peer = self._parties.get(envelope.source)
+        if peer is None:
+            peer = self._parties[envelope.source] = self._directory.party(envelope.source)
         if isinstance(message, _ANSWERS):
             self.node.caller(peer).receive(now, message)
         elif isinstance(message, Hello):

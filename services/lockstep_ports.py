@@ -25,7 +25,8 @@ class MemoryCan:
 
     def send(self, frame: Frame) -> None:
         """Put a frame on the bus. Raises ConnectionError when the port is closed."""
-        self._check()
+        if self._closed:
+            self._check()
         self.out.append(frame)
 
     def receive(self) -> Sequence[Frame]:
@@ -58,6 +59,7 @@ class LockstepPorts:
         self._wish = 0
         self._streams: dict[str, SetpointReceiver] = {}
         self._raised: list[tuple[str, Mapping[str, Any]]] = []
+        self._lives_at = ""
 
     @property
     def now(self) -> float:
@@ -130,7 +132,8 @@ class LockstepPorts:
         self._post(Envelope(laboratory, self._device.name, laboratory, channel, body))
 
     def _laboratory(self) -> str:
-        laboratory = self._directory.laboratory()
-        if not laboratory:
+        if not self._lives_at:
+            self._lives_at = self._directory.laboratory()
+        if not self._lives_at:
             raise ValueError('lock step needs a simulated node; write sim = "module:function" in one [nodes.NAME]')
-        return laboratory
+        return self._lives_at

@@ -149,7 +149,7 @@ class Node:
 
     def advance_places(self, now: float) -> bool:
         """Timers, runs and devices alone; says whether anything came of it. That is all that `advance` does while nothing has
-        come in and `ends_due` is still to come: a shell that knows may call this instead, then `settle` if something came."""
+        come in and `ends_quiet` holds: a shell that knows may call this instead, then `settle` if something came."""
         self._now = now
         news = False
         for name in self._timers.advance(now):
@@ -169,11 +169,11 @@ class Node:
         self._answer_runs(now)
         self._answer_commands(now)
 
-    def ends_due(self) -> float:
-        """When calls and commands have something to do by time alone, as far as is known now (s)."""
-        dues = [command.due for command in self._commands.values()]
-        dues += [end.soonest for end in (self.callee, *self.callers.values())]
-        return min(*dues, self._stops.due)
+    def ends_quiet(self, now: float) -> bool:
+        """Whether time alone gives calls, commands and the emergency stop nothing to do yet."""
+        if self._commands or now >= self.callee.soonest or now >= self._stops.due:
+            return False
+        return all(now < caller.soonest for caller in self.callers.values())
 
     def _advance_ends(self, now: float) -> None:
         """What time does at both ends of calls; asking for the next due time keeps `soonest` up to date."""

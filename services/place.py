@@ -18,6 +18,10 @@ SLACK = 1e-6  # s: binary fractions of a period must not cost a whole tick
 class Place(Protocol):
     """Runs of one device, or of all actions that need none. Orders in, reports out, nothing blocks."""
 
+    @property
+    def idle(self) -> bool:
+        """Whether `advance` would do nothing and `reports` say nothing until an order or a command comes."""
+
     def take(self, now: float, order: Order) -> None:
         """Take an order about a run."""
 
@@ -139,6 +143,11 @@ class InlinePlace:
     def polling(self) -> bool:
         """Whether a run waits for more than time, so that `advance` must be called often."""
         return self._runner.polling
+
+    @property
+    def idle(self) -> bool:
+        """Whether there is neither a run nor a cyclic driver, nor anything to tell."""
+        return self._cyclic is None and not self._told and self._runner.idle
 
     def advance(self, now: float) -> None:
         """Runs first, then as many cycles of the driver as are due."""

@@ -78,6 +78,11 @@ class Runner:
         return any(run.polls for run in self._runs.values())
 
     @property
+    def idle(self) -> bool:
+        """Whether there is no run, nothing to report and no fence to look at."""
+        return not (self._runs or self._reports or self._fenced)
+
+    @property
     def held(self) -> bool:
         """Whether the operator holds the runs."""
         return self._held_since is not None

@@ -260,6 +260,9 @@ class WorkerPlace:
         self._worker.post(flat(stop))
         self._worker.post([PING, self._pings])
 
+    idle = False
+    """Its processes may say something at any time."""
+
     def advance(self, now: float) -> None:
         """Start again what died; stop what is over its deadline; kill what hangs."""
         if self._restart_at is not None and now >= self._restart_at:

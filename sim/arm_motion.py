@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from services.comm.compiled import kernel
 
 Six = tuple[float, float, float, float, float, float]
@@ -167,3 +169,38 @@ def stepped(
         return q, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), friction, True
     q, speed = moved(dt, q, speed, lower, upper)
     return q, speed, friction, False
+
+
+@kernel
+def _six(numbers: Sequence[float], first: int) -> Six:
+    return (
+        numbers[first],
+        numbers[first + 1],
+        numbers[first + 2],
+        numbers[first + 3],
+        numbers[first + 4],
+        numbers[first + 5],
+    )
+
+
+@kernel
+def _matrix(rows: Sequence[float]) -> Matrix:
+    return _six(rows, 0), _six(rows, 6), _six(rows, 12), _six(rows, 18), _six(rows, 24), _six(rows, 30)
+
+
+@kernel
+def stepped_packed(
+    dt: float, q: Six, qd: Six, tau: Six, bias: Six, friction: Six, inverse: Sequence[float], numbers: Sequence[float]
+) -> tuple[Six, Six, Six, bool]:
+    """`stepped`, where what seldom changes comes packed: the matrix row by row, then limit, greatest, viscous, hold, stick, lower
+    and upper in one. Compiled, handing those over as tuples takes as long as the step itself."""
+    limit, greatest, viscous = _six(numbers, 0), _six(numbers, 6), _six(numbers, 12)
+    hold, stick, lower, upper = _six(numbers, 18), _six(numbers, 24), _six(numbers, 30), _six(numbers, 36)
+    matrix = _matrix(inverse)
+    return stepped(dt, q, qd, tau, bias, matrix, friction, limit, greatest, viscous, hold, stick, lower, upper)
+
+
+@kernel
+def held_packed(tau: Six, speed: Six, bias: Six, numbers: Sequence[float]) -> bool:
+    """Whether friction and brakes hold an arm that stands, its motors asked for `tau`; `numbers` as in `stepped_packed`."""
+    return held(motors(tau, _six(numbers, 0), speed, _six(numbers, 6)), bias, _six(numbers, 24))

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sim.occluders import Box, Occluders, fill
-from sim.scenery import Chessboard, Table, floor_grey, supersampled
+from sim.scenery import Chessboard, Table, floor_grey, stripes, supersampled
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -31,6 +31,7 @@ NOISE_ZERO = 128
 NOISE_SIZE = 1280
 LIGHT_DIRECTION = np.array([-0.25, 0.35, 0.90]) / np.linalg.norm([-0.25, 0.35, 0.90])
 """Towards the lamp, base frame."""
+_TO_LAMP: Sequence[float] = LIGHT_DIRECTION.tolist()
 LENS_STEPS = 6
 
 
@@ -148,8 +149,10 @@ class PinholeCamera:
                 (du - 2.0 * p1 * x * y - p2 * (square + 2.0 * x * x)) / radial,
                 (dv - p1 * (square + 2.0 * y * y) - 2.0 * p2 * x * y) / radial,
             )
-        direction = np.stack([x, y, np.ones_like(x)], axis=-1)
-        return np.asarray(direction / np.linalg.norm(direction, axis=-1, keepdims=True))
+        direction = np.empty((*x.shape, 3))
+        length = np.sqrt(x * x + (y * y + 1.0))
+        direction[..., 0], direction[..., 1], direction[..., 2] = x / length, y / length, 1.0 / length
+        return direction
 
     def _on_plane(self, pixels: Array, origin: Array, normal: Array) -> Array:
         """Base-frame points (..., 3) where pixels look through a plane."""
@@ -170,7 +173,10 @@ class PinholeCamera:
     @cached_property
     def _rays(self) -> NDArray[np.float32]:
         """Unit directions (3, height, width), camera frame, in which the pixels look."""
-        return np.ascontiguousarray(np.moveaxis(self.rays(self._grid), -1, 0), np.float32)
+        rays = np.empty((3, self.height, self.width), np.float32)
+        for rows in stripes(self.height):
+            rays[:, rows] = np.moveaxis(self.rays(self._grid[rows]), -1, 0)
+        return rays
 
     @cached_property
     def _to_lamp(self) -> NDArray[np.float32]:
@@ -184,6 +190,11 @@ class PinholeCamera:
         v = (self._grid[..., 1] - (self.height - 1) / 2) / self.height
         gradient = 1.0 + self.view.light_gradient[0] * u + self.view.light_gradient[1] * v
         return (gradient * (1.0 - self.view.vignetting * 2.0 * (u * u + v * v))).astype(np.float32)
+
+    @cached_property
+    def _ball_grey(self) -> NDArray[np.float32]:
+        """Grey level of a ball that faces the lamp (height, width)."""
+        return BALL_GREY * self.illumination
 
     def _scene_grey(self, pixels: Array) -> Array:
         up = np.array([0.0, 0.0, 1.0])
@@ -225,6 +236,7 @@ class PinholeCamera:
         points = np.empty((0, 2, 3)) if arm_points is None else np.asarray(arm_points, float).reshape(-1, 2, 3)
         covers = self._occluders.covers(points, np.asarray(arm_radii, float).ravel(), pose)
         changed = [cover.box for cover in covers]
+        glaring = [cover.box for cover in covers if not self._bears_noise(cover.grey)]
         picture = self._canvas
         if ball is None:
             fill(picture, covers)
@@ -234,9 +246,11 @@ class PinholeCamera:
             above = [cover for cover in covers if cover.height > centre[2] and not (cover.cup and in_cup)]
             fill(picture, [cover for cover in covers if cover not in above])
             box = self._paint_ball(picture, centre, np.asarray(ball_velocity, float))
-            changed += [] if box is None else [box]
+            if box is not None:
+                changed.append(box)
+                glaring.append(box)
             fill(picture, above)
-        image = self._expose(picture, light, changed)
+        image = self._expose(picture, light, glaring)
         for box in changed:
             picture[box] = self.background[box]
         return image
@@ -249,8 +263,18 @@ class PinholeCamera:
     @cached_property
     def _sound(self) -> bool:
         """Whether noise never takes the background beyond black or white, so that it may be added without a look."""
-        noise, scene = self._noise.astype(int) - NOISE_ZERO, self.background
-        return bool(scene.min() + noise.min() >= 0 and scene.max() + noise.max() <= 255)
+        return self._bears_noise(float(self.background.min())) and self._bears_noise(float(self.background.max()))
+
+    @cached_property
+    def _noise_range(self) -> tuple[int, int]:
+        """Least and greatest grey level that noise adds."""
+        return int(self._noise.min()) - NOISE_ZERO, int(self._noise.max()) - NOISE_ZERO
+
+    def _bears_noise(self, grey: float) -> bool:
+        """Whether noise never takes this grey level, rounded either way, beyond black or white. Edges drawn smooth lie between
+        two such levels."""
+        least, most = self._noise_range
+        return math.floor(grey) + least >= 0 and math.ceil(grey) + most <= 255
 
     def render_board(self, pose: ArrayLike, board: Chessboard | None = None, light: float = 1.0) -> Picture:
         """One image of a calibration board held at `pose` (4, 4), board frame to base frame; nothing else in view."""
@@ -271,17 +295,17 @@ class PinholeCamera:
             picture[box] = np.where(seen, np.clip(np.rint(grey), 0, 255).astype(np.uint8), picture[box])
         return self._expose(picture, light, None)
 
-    def _expose(self, picture: Picture, light: float, changed: Sequence[Box] | None) -> Picture:
+    def _expose(self, picture: Picture, light: float, glaring: Sequence[Box] | None) -> Picture:
         """Light and noise over the whole image: a window of the noise field that the generator chooses. Outside the boxes
-        `changed` the picture is the background (None: it may differ anywhere)."""
+        `glaring` the picture bears noise as the background does (None: it may be as bright or dark as it likes anywhere)."""
         row = int(self._rng.integers(NOISE_SIZE - self.height + 1))
         column = int(self._rng.integers(NOISE_SIZE - self.width + 1))
         window = slice(row, row + self.height), slice(column, column + self.width)
         noise = self._noise[window]
-        if light != 1.0 or changed is None or not self._sound:
+        if light != 1.0 or glaring is None or not self._sound:
             return np.asarray(cv2.addWeighted(picture, light, noise, 1.0, -NOISE_ZERO), np.uint8)
-        image = self.background + self._grain[window]  # the same sum in a tenth of the time
-        for box in changed:
+        image = picture + self._grain[window]  # the same sum in a tenth of the time
+        for box in glaring:
             image[box] = cv2.addWeighted(picture[box], 1.0, noise[box], 1.0, -NOISE_ZERO)
         return image
 
@@ -289,10 +313,12 @@ class PinholeCamera:
 
     def _paint_ball(self, picture: Picture, ball: Array, velocity: Array) -> Box | None:
         """Ball and shadow; gives the box that they may have changed."""
-        height = float(ball[2]) - self.table.top
-        foot = (ball - LIGHT_DIRECTION * (height / LIGHT_DIRECTION[2])).tolist()
-        (u, v, depth), (foot_u, foot_v, foot_depth) = self.pixel(ball.tolist()), self.pixel(foot)
-        later_u, later_v, _ = self.pixel((ball + 0.5 * self.exposure * velocity).tolist())
+        at, (lx, ly, lz), half = ball.tolist(), _TO_LAMP, 0.5 * self.exposure
+        height = at[2] - self.table.top
+        fall = height / lz
+        foot = at[0] - lx * fall, at[1] - ly * fall, at[2] - lz * fall
+        (u, v, depth), (foot_u, foot_v, foot_depth) = self.pixel(at), self.pixel(foot)
+        later_u, later_v, _ = self.pixel([p + half * w for p, w in zip(at, velocity.tolist(), strict=True)])
         travel_u, travel_v = later_u - u, later_v - v
         reach = 2.2 * self.ball_radius * self.focal / depth
         box = self._box(u, v, reach + abs(travel_u), reach + abs(travel_v))
@@ -308,7 +334,7 @@ class PinholeCamera:
             centre = self.rotation @ (ball - self.position)
             cover, shade = self._sphere(centre, self.rotation @ velocity, math.hypot(travel_u, travel_v), near)
             part *= 1.0 - cover
-            part += shade * (BALL_GREY * self.illumination[near])
+            part += shade * self._ball_grey[near]
         picture[box] = np.rint(np.minimum(region, 255.0, out=region), out=region)
         return box
 

@@ -121,8 +121,8 @@ class Laboratory(LaboratoryParty):
     def _picture(self, now: float) -> Picture:
         ball, cup = self.world.ball, self._cup_now()
         ends, radii = self._solid_parts
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = cup.rotation(), cup.origin
+        pose = np.zeros((4, 4))
+        pose[:3], pose[3, 3] = np.array(cup).T, 1.0
         return self.camera().render(
             None if ball is None else ball.position,
             (0.0, 0.0, 0.0) if ball is None else ball.velocity,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from typing import Any, ClassVar
 
 from services.comm.callee import Callee, Offer
@@ -36,7 +37,7 @@ class LaboratoryParty(ABC):
         offers = {service: Offer(inline=lambda _, call: self.answer(call)) for service in self.services}
         self.callee = Callee(name, boot, offers, directory=directory)
         self.exposures = Exposures()
-        self._where = where
+        self._where = cache(where)
         self._camera_at: dict[str, str] = {}
         self._bus_ports: list[str] = []
         self._out: list[Envelope] = []

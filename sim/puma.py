@@ -10,11 +10,13 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pybullet
 
-from sim.arm_motion import Matrix, Six, held, motors, stepped
+from services.comm.compiled import packed
+from sim.arm_motion import Matrix, Six, held, held_packed, motors, stepped, stepped_packed
 from sim.puma_model import JOINTS, ArmModel, Link
 from sim.puma_urdf import urdf
 from sim.truth import Vector
@@ -98,6 +100,9 @@ class ArmPlant:
         self._ends = _six(model.lower), _six(model.upper)
         self._braked = [True] * JOINTS
         self._hold = self._stick = _REST
+        self._greatest = _six(model.speed)
+        self._packs = hasattr(stepped_packed, "py_func")
+        """Whether kernels are compiled: then they are handed what seldom changes packed, else as it stands."""
         for joint in range(JOINTS):
             self.brake(joint)
         self._friction = _REST
@@ -108,7 +113,7 @@ class ArmPlant:
 
     def _warm_up(self) -> None:
         """Kernels are compiled, or read from where they are kept, now and not when the arm first moves."""
-        held(motors(_REST, self._limit, self.qd, self._greatest), self._bias, self._stick)
+        self._held(_REST)
         self._stepped(0.001, _REST, self._bias)
 
     @property
@@ -122,18 +127,27 @@ class ArmPlant:
         self._braked[joint] = True
         hold = self._dry[joint] + _BRAKE * self._limit[joint]
         self._hold, self._stick = _put(self._hold, joint, hold), _put(self._stick, joint, hold)
+        self._pack()
 
     def release(self, joint: int) -> None:
         """Release the brake of a joint (0 to 5)."""
         self._braked[joint] = False
         self._hold = _put(self._hold, joint, self._dry[joint])
         self._stick = _put(self._stick, joint, _STICTION * self._dry[joint])
+        self._pack()
 
     def slow_down(self, factor: float) -> None:
         """From now on the joints reach this share (0 to 1] of their greatest speeds."""
         if not 0.0 < factor <= 1.0:
             raise ValueError(f"speed factor {factor}: must be above 0 and at most 1")
         self._greatest = _six(self.model.speed * factor)
+        self._pack()
+
+    def _pack(self) -> None:
+        """The numbers that compiled kernels read have changed."""
+        if self._packs:
+            groups = self._limit, self._greatest, self._viscous, self._hold, self._stick, *self._ends
+            self._numbers = packed(stepped_packed, [number for group in groups for number in group])
 
     def step(self, dt: float, tau: Sequence[float] | None = None) -> None:
         """Move on by `dt` (s) under torques `tau` (six, N m), those in `self.tau` if None."""
@@ -141,7 +155,7 @@ class ArmPlant:
             self.tau[:] = tau
         a, b, c, d, e, f = self.tau
         asked = a, b, c, d, e, f
-        if self.still and held(motors(asked, self._limit, self.qd, self._greatest), self._bias, self._stick):
+        if self.still and self._held(asked):
             return
         if not self._near(self.q):
             self._refresh()
@@ -149,8 +163,16 @@ class ArmPlant:
         self.moves += 1
         self.q, self.qd, self._friction, self.still = self._stepped(dt, asked, bias)
 
+    def _held(self, asked: Six) -> bool:
+        """Whether friction and brakes hold the standing arm under these torques."""
+        if self._packs:
+            return held_packed(asked, self.qd, self._bias, self._numbers)
+        return held(motors(asked, self._limit, self.qd, self._greatest), self._bias, self._stick)
+
     def _stepped(self, dt: float, asked: Six, bias: Six) -> tuple[Six, Six, Six, bool]:
         """Angles, speeds and dry friction after `dt`, and whether the arm then stands still."""
+        if self._packs:
+            return stepped_packed(dt, self.q, self.qd, asked, bias, self._friction, self._rows, self._numbers)
         return stepped(
             dt,
             self.q,
@@ -175,8 +197,11 @@ class ArmPlant:
 
     def _refresh(self) -> None:
         inverse = np.linalg.inv(self._body.mass_matrix(self.q) + self._rotors)
-        a, b, c, d, e, f = (_six(row) for row in inverse)
-        self._inverse: Matrix = a, b, c, d, e, f
+        if self._packs:
+            self._rows: Any = inverse.ravel()
+        else:
+            a, b, c, d, e, f = map(_six, inverse.tolist())
+            self._inverse: Matrix = a, b, c, d, e, f
         self._at = self.q
 
     def close(self) -> None:

@@ -5,7 +5,7 @@ Surfaces are planes with a grey level under even light; `sim/camera.py` adds lig
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,6 +27,8 @@ CENTRE_LINE = 0.003
 TILE = 0.40
 JOINT = 0.008
 MARK_RADIUS = 0.018
+STRIPE = 8
+"""Rows of an image that are worked out at a time."""
 MARKS = ((0.25, 0.22), (0.25, -0.30), (0.80, 0.36), (0.80, -0.20), (1.30, 0.28), (1.30, -0.36))
 """Round stickers on the table, as large as a ball: (m from the near edge, y); they tempt a detector that looks for circles."""
 
@@ -107,9 +109,16 @@ class Chessboard:
         return np.array([[near, near, 0.0], [right, near, 0.0], [right, far, 0.0], [near, far, 0.0]])
 
 
+def stripes(rows: int) -> Iterator[slice]:
+    """An image's rows, a few at a time: what is worked out of so many pixels fits into a core's cache."""
+    return (slice(first, first + STRIPE) for first in range(0, rows, STRIPE))
+
+
 def supersampled(pixels: NDArray[np.float64], grey_at: Callable[[NDArray[np.float64]], Array], samples: int) -> Array:
     """Mean grey level of each pixel from `samples` x `samples` points inside it; `pixels` (..., 2), result (...)."""
     steps = (np.arange(samples) + 0.5) / samples - 0.5
     offsets = [np.array([du, dv]) for dv in steps for du in steps]
-    mean: Array = np.mean([grey_at(pixels + offset) for offset in offsets], axis=0)
+    mean: Array = np.empty(pixels.shape[:-1])
+    for rows in stripes(len(pixels)):
+        mean[rows] = np.mean([grey_at(pixels[rows] + offset) for offset in offsets], axis=0)
     return mean

@@ -61,8 +61,8 @@ class JointServo:
         """Take the next set point (rad); one that asks for more than the greatest speed is cut and marks `limited`."""
         if self._ramp is not None:
             return
-        last = self._points[2]
-        if self.standing and target == last:
+        _, before, last = self._points
+        if target == last and self.standing:
             self.limited = False
             return
         most = self.limit * self.period
@@ -70,7 +70,7 @@ class JointServo:
         self.limited = abs(step) > most * (1.0 + 1e-3)
         if self.limited:
             target = last + math.copysign(most, step)
-        self._pass(self._points[1], last, target)
+        self._pass(before, last, target)
         self._since = 0.0
 
     def ramp_down(self, deceleration: float) -> None:

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from services.comm.directory import Directory
+from sim.arm_motion import Six
+from sim.cup_motion import carried, numbers_of
 from sim.drives import ratings
 from sim.puma_model import ArmModel, Frame3, Link, read_arm
 from sim.servo import DriveRating
@@ -70,13 +72,12 @@ class CupMount:
         self._y = _cross(self._z, self._x)
         self._mouth = _triple(mouth)
         self._bottom = _triple(mouth - truth.cup.depth * axis)
+        self._numbers = numbers_of(arm, self._zero, (self._x, self._y, self._z), self._mouth)
 
-    def frame(self, q: Sequence[float]) -> Frame3:
-        """The cup's frame at encoder angles (six, rad): origin in the middle of the mouth, z out of it."""
-        flange = self._arm.flange_frame(self._true(q))
-        at = flange.origin
-        x, y, z = (_minus(flange.point(axis), at) for axis in (self._x, self._y, self._z))
-        return Frame3(x, y, z, flange.point(self._mouth))
+    def frame(self, q: Six) -> Frame3:
+        """The cup's frame at encoder angles (rad): origin in the middle of the mouth, z out of it."""
+        x, y, z, origin = carried(q, self._numbers)
+        return Frame3(x, y, z, origin)
 
     def solid_parts(self, q: Sequence[float]) -> tuple[Any, Any]:
         """Capsules of the arm at encoder angles: end points (6, 2, 3) and radii (6,), m, base frame."""
@@ -107,7 +108,3 @@ def _cross(a: Triple, b: Triple) -> Triple:
 def _unit(a: Triple) -> Triple:
     size = (a[0] ** 2 + a[1] ** 2 + a[2] ** 2) ** 0.5
     return a[0] / size, a[1] / size, a[2] / size
-
-
-def _minus(a: Triple, b: Triple) -> Triple:
-    return a[0] - b[0], a[1] - b[1], a[2] - b[2]

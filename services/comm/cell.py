@@ -52,11 +52,12 @@ class Delays:
         """Ticks that this envelope is on its way."""
         if not self._table:
             return 1
-        way = envelope.source, envelope.target, envelope.channel
+        way = envelope[1:4]
         ticks = self._ways.get(way)
         if ticks is None:
-            by_ends = self._table.get(f"{envelope.source}/{envelope.target}")
-            ticks = self._ways[way] = self._table.get(envelope.channel, 1) if by_ends is None else by_ends
+            source, target, channel = way
+            by_ends = self._table.get(f"{source}/{target}")
+            ticks = self._ways[way] = self._table.get(channel, 1) if by_ends is None else by_ends
         return ticks
 
 
@@ -67,14 +68,15 @@ def as_received(channel: str, body: Any) -> Any:
     Raises NotPlainError or ProtocolError for what no envelope carries.
     """
     kind = type(body)
-    if kind in SCALARS or (kind is Frame and channel == "can"):
-        return body
-    if kind in _MESSAGES:
-        return decode(encode(body))
     if kind is tuple:
-        kinds = set(map(type, body))
-        if (channel == "can" and kinds == _FRAMES) or kinds <= _FLAT:
+        if channel == "can" and body and _FRAMES.issuperset(map(type, body)):
             return body
+        if _FLAT.issuperset(map(type, body)):
+            return body
+    elif kind in SCALARS or (kind is Frame and channel == "can"):
+        return body
+    elif kind in _MESSAGES:
+        return decode(encode(body))
     if isinstance(body, np.ndarray):
         return body if _frozen(body) else copy_array(body)
     if isinstance(body, (tuple, list)):
@@ -121,7 +123,8 @@ class Half:
         for name, party in self._parties.items():
             due = self._inboxes[name].pop(tick, None)
             if due is not None:
-                due.sort(key=_ORDER)
+                if len(due) > 1:
+                    due.sort(key=_ORDER)
                 for _, _, _, envelope in due:
                     party.receive(now, envelope)
             party.advance(now)
@@ -135,9 +138,13 @@ class Half:
 
     def deliver(self, sent: int, posted: Posted) -> None:
         """Put an envelope that was sent at this tick into its party's inbox."""
-        envelope = posted.envelope
-        inbox = self._inboxes[envelope.party].setdefault(posted.due, [])
-        inbox.append((sent, envelope.source, posted.sequence, envelope))
+        due, sequence, envelope = posted
+        inbox = self._inboxes[envelope.party]
+        one = sent, envelope.source, sequence, envelope
+        if due in inbox:
+            inbox[due].append(one)
+        else:
+            inbox[due] = [one]
 
     def own(self, source: str, party: str) -> None:
         """Note which party an endpoint lives in. Raises CellError if two parties send under one name."""
@@ -146,20 +153,18 @@ class Half:
             raise CellError(f"{owner} and {party} both send as {source}; an endpoint lives in one party")
 
     def _post(self, tick: int, sender: str, envelope: Envelope) -> Posted:
-        source = envelope.source
+        party, source, target, channel, sent = envelope
         if self._owners.get(source) != sender:
             self.own(source, sender)
-        if envelope.party not in self._names:
-            raise CellError(
-                f"{source} sends to the party {envelope.party}, which is not in the cell: {sorted(self._names)}"
-            )
+        if party not in self._names:
+            raise CellError(f"{source} sends to the party {party}, which is not in the cell: {sorted(self._names)}")
         try:
-            body = as_received(envelope.channel, envelope.body)
+            body = as_received(channel, sent)
         except Exception as fault:
-            text = f"{source} sends {envelope.target} on {envelope.channel} what no envelope carries: {fault}"
+            text = f"{source} sends {target} on {channel} what no envelope carries: {fault}"
             raise CellError(text) from fault
-        if body is not envelope.body:
-            envelope = Envelope(envelope.party, source, envelope.target, envelope.channel, body)
+        if body is not sent:
+            envelope = Envelope(party, source, target, channel, body)
         sequence = self._sequences.get(source, 0)
         self._sequences[source] = sequence + 1
         return Posted(tick + self._delays.ticks(envelope), sequence, envelope)

@@ -9,8 +9,10 @@ that would have to be done anew in every process. `PETROBOT_COMPILED=0` in the e
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, ParamSpec, TypeVar
+
+import numpy as np
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -37,6 +39,15 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     except RuntimeError:  # there is nowhere to keep what is compiled
         return function
     return compiled
+
+
+def packed(function: Callable[..., Any], numbers: Iterable[float]) -> Sequence[float]:
+    """Numbers that a kernel reads by place and that seldom change, as its callers best hand them over: an array to a compiled
+    one, which takes it as it is (many floats of a tuple are each taken apart), else a tuple of floats."""
+    if hasattr(function, "py_func"):
+        array: Any = np.array(list(numbers), dtype=np.float64)
+        return array  # type: ignore[no-any-return]
+    return tuple(map(float, numbers))
 
 
 def plain(function: Callable[P, R]) -> Callable[P, R]:

@@ -9,15 +9,13 @@ one and the same run, and so does moving an endpoint to another party.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 TICK = 0.004
 """Length of a lock-step tick (s): one cycle of the 250 Hz servo loop."""
 
 
-@dataclass(frozen=True, slots=True)
-class Envelope:
+class Envelope(NamedTuple):
     """A message on its way. `source` and `target` are endpoint names (an action, a device, a service or a party), not processes.
 
     `channel` says what `body` is: "call" a message of the node protocol, "can" a `Frame`, "image" an `Image` body,

@@ -14,9 +14,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from services.comm import compiled
-from services.comm.compiled import COMPILED, SWITCH
-from sim import arm_motion
-from sim.arm_motion import Matrix, Six, accelerated, held, motor, moved, stepped
+from services.comm.compiled import COMPILED, SWITCH, packed
+from sim import arm_motion, cup_motion
+from sim.arm_motion import (
+    Matrix,
+    Six,
+    accelerated,
+    held,
+    held_packed,
+    motor,
+    motors,
+    moved,
+    stepped,
+    stepped_packed,
+)
+from sim.cup_motion import Triple, carried, numbers_of
+from sim.puma_model import ArmModel
 
 ZERO: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 TALL: Six = (1e9, 1e9, 1e9, 1e9, 1e9, 1e9)
@@ -136,6 +149,50 @@ def test_a_compiled_step_gives_the_same_bits(
     arguments = 0.002, q, qd, tau, bias, inverse_of(seed), friction, *rest
     as_it_stands = compiled.plain(arm_motion.stepped)
     assert bits(*arm_motion.stepped(*arguments)) == bits(*as_it_stands(*arguments))
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    q=sixes(-3.0, 3.0),
+    qd=sixes(-6.0, 6.0),
+    tau=sixes(-250.0, 250.0),
+    bias=sixes(-90.0, 90.0),
+    friction=sixes(-8.0, 8.0),
+    hold=sixes(0.0, 30.0),
+    seed=st.integers(0, 99),
+)
+def test_numbers_that_come_packed_give_the_same_bits(
+    q: Six, qd: Six, tau: Six, bias: Six, friction: Six, hold: Six, seed: int
+) -> None:
+    limit, greatest, inverse = (90.0,) * 6, (2.0,) * 6, inverse_of(seed)
+    rest = limit, greatest, (1.5, 1.6, 1.7, 1.8, 1.9, 2.0), hold, (9.0,) * 6, (-2.5,) * 6, (2.5,) * 6
+    numbers = packed(stepped_packed, [number for group in rest for number in group])
+    rows = packed(stepped_packed, [number for row in inverse for number in row])
+    plainly = stepped(0.002, q, qd, tau, bias, inverse, friction, *rest)
+    assert bits(*stepped_packed(0.002, q, qd, tau, bias, friction, rows, numbers)) == bits(*plainly)
+    assert held_packed(tau, qd, bias, numbers) == held(motors(tau, limit, qd, greatest), bias, (9.0,) * 6)
+
+
+TRIPLE = st.tuples(*[st.floats(-1.0, 1.0, allow_subnormal=False)] * 3)
+
+
+@settings(max_examples=100, deadline=None)
+@given(q=sixes(-3.2, 3.2), zero=sixes(-0.01, 0.01), axes=st.tuples(TRIPLE, TRIPLE, TRIPLE), origin=TRIPLE)
+def test_what_the_flange_carries_is_where_the_arms_frames_put_it_to_the_bit(
+    arm: ArmModel, q: Six, zero: Six, axes: tuple[Triple, Triple, Triple], origin: Triple
+) -> None:
+    numbers = numbers_of(arm, zero, axes, origin)
+    flange = arm.flange_frame([angle + off for angle, off in zip(q, zero, strict=True)])
+    turned = [tuple(a - b for a, b in zip(flange.point(axis), flange.origin, strict=True)) for axis in axes]
+    assert bits(*carried(q, numbers)) == bits(*turned, flange.point(origin))
+    assert bits(*compiled.plain(cup_motion.carried)(q, tuple(numbers))) == bits(*turned, flange.point(origin))
+
+
+def test_numbers_are_packed_for_compiled_kernels_alone() -> None:
+    assert packed(compiled.plain(stepped_packed), [1, 2.5]) == (1.0, 2.5)
+    if COMPILED:
+        array: Any = packed(stepped_packed, [1, 2.5])
+        assert isinstance(array, np.ndarray) and array.tolist() == [1.0, 2.5]
 
 
 def test_numba_can_be_left_out() -> None:

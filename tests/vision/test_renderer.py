@@ -156,3 +156,27 @@ def test_board_corners_are_where_they_project(clean: PinholeCamera) -> None:
     limit = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 40, 0.001)
     found = cv2.cornerSubPix(picture, wanted.copy(), (5, 5), (-1, -1), limit)
     assert np.abs(found - wanted).mean() < 0.1
+
+
+def test_noise_added_without_a_look_is_the_noise_added_with_one(cell: dict[str, Any]) -> None:
+    """Arm, cup and ball in view or not: the short way to an image gives every pixel of the long one."""
+    rng = np.random.default_rng(4)
+    short, long = (PinholeCamera(cell, true_view(cell), np.random.default_rng(7)) for _ in range(2))
+    assert short._sound
+    long.__dict__["_sound"] = False
+    for _ in range(40):
+        ball = rng.uniform((0.5, -0.5, 0.60), (2.3, 0.5, 0.75)) if rng.random() < 0.8 else None
+        arm, pose = rng.uniform((0.2, -0.5, 0.5), (1.4, 0.5, 1.0), (6, 2, 3)), np.eye(4)
+        pose[:3, 3] = rng.uniform((0.5, -0.4, 0.6), (1.3, 0.4, 0.8))
+        given = ball, rng.uniform(-2.0, 2.0, 3), arm, np.full(6, 0.05), pose
+        assert np.array_equal(short.render(*given), long.render(*given))
+
+
+def test_a_scene_drawn_in_stripes_is_the_scene_drawn_at_once(
+    cell: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    striped, whole = (PinholeCamera(cell, true_view(cell), np.random.default_rng(0)) for _ in range(2))
+    striped.warm_up()
+    monkeypatch.setattr("sim.scenery.STRIPE", whole.height)
+    whole.warm_up()
+    assert np.array_equal(striped.background, whole.background) and np.array_equal(striped._rays, whole._rays)
