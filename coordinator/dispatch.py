@@ -32,7 +32,7 @@ from services.comm.messages import Answer, Call, Command, Outcome
 ESCALATION: Final = 3.0
 """Seconds after a run's own time to stop that its node needs at most for the stop routine and the kill of its worker."""
 RESUMED: Final = "resumed"
-_GIVEN_UP: Final = UNSURE | {RESUMED, "rebooted", "refused", "unreachable"}
+_GIVEN_UP: Final = UNSURE | {RESUMED, "refused", "unreachable"}
 """Causes by which this side ended a run without word of its node."""
 _TIMERS: Final = (ArmTimer, DisarmTimer, HoldTimer, ReleaseTimer)
 

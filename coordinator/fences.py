@@ -8,8 +8,10 @@ from typing import Final
 
 STOP_MARGIN: Final = 2.0
 """Seconds that a node's stop routine may take after a run's orphan time (docs/semantics.md, cancel)."""
-UNSURE: Final = frozenset({"lost", "no_answer", "not_accepted"})
-"""Causes after which a device may still be moving: its node has not said that the run is over."""
+REBOOTED: Final = "rebooted"
+UNSURE: Final = frozenset({"lost", "no_answer", "not_accepted", REBOOTED})
+"""Causes after which a device may still be moving: its node has not said that the run is over, or is another process, and the
+former one's devices may be in the middle of their stop routines."""
 FOR_GOOD: Final = math.inf
 
 
@@ -47,7 +49,9 @@ class Fences:
         A node that was lost stops the run itself once it has missed its coordinator for the orphan time. One that is there and
         does not say that the run has stopped can be waited for only.
         """
-        return FOR_GOOD if cause == "no_answer" else now + (orphan_time or 0.0) + STOP_MARGIN
+        if cause == "no_answer":
+            return FOR_GOOD
+        return now + STOP_MARGIN + (0.0 if cause == REBOOTED else orphan_time or 0.0)
 
     def lift(self, run: str) -> list[str]:
         """The run is known to be over: gives the devices that are free by that."""

@@ -26,6 +26,7 @@ from coordinator.cli.replaying import recorded
 from coordinator.engine import Finished, Fired, RunRecorded, StartRun
 from coordinator.journal import JournalError, read_journal
 from coordinator.launch import local_programs, with_runs
+from coordinator.recording import STIMULUS
 from coordinator.runfolder import JOURNAL, RESULT
 from coordinator.supervisor import Supervisor
 from coordinator.task import Status
@@ -36,9 +37,9 @@ from tests.waiting import beat
 
 MARK = "PETROBOT_STORM"
 """Environment variable that all processes of a storm carry."""
-LONGEST = 90.0
+LONGEST = 240.0
 """Seconds after which a mission run counts as hanging."""
-RUNS = 6
+RUNS = 24
 QUIET = ("--quiet", "--no-page")
 KILLS = 4
 """Times at most that the coordinator of one mission run is killed: it has to come to its end some day."""
@@ -51,9 +52,16 @@ class Weather:
     """What breaks, and when: all drawn from a seed."""
 
     def __init__(
-        self, seed: int, supervisor: Supervisor, proxy: asyncio.subprocess.Process, crash: asyncio.Event, lo: bool
+        self,
+        seed: int,
+        supervisor: Supervisor,
+        proxy: asyncio.subprocess.Process,
+        crash: asyncio.Event,
+        lo: bool,
+        ports: list[int],
     ) -> None:
-        """`crash` is set when the coordinator shall die."""
+        """`crash` is set when the coordinator shall die; nodes listen at `ports`."""
+        self._ports = ports
         self._crashing = crash
         self._draw = np.random.default_rng(seed)
         self._supervisor = supervisor
@@ -86,7 +94,9 @@ class Weather:
                 _signal(process, signal.SIGCONT)
 
     async def _kill_node(self) -> None:
-        _signal(self._node(), signal.SIGKILL)
+        """Unless one is still being started: on a busy machine nothing would ever be up for long enough to break."""
+        if all([await _listens(port) for port in self._ports]):
+            _signal(self._node(), signal.SIGKILL)
 
     async def _kill_worker(self) -> None:
         _signal(self._worker(), signal.SIGKILL)
@@ -158,6 +168,7 @@ class Storm:
     async def pass_over(self, seconds: float) -> dict[str, Any]:
         """Run missions for so long in the storm, then one in calm weather; what was seen."""
         pairs = [f"{port}:{self._directory.nodes[n].port}" for port, n in zip(self._proxied, NODES, strict=True)]
+        ports = [self._directory.nodes[name].port for name in NODES]
         command = [sys.executable, "-m", "tests.chaos.proxy", *pairs]
         pipe = asyncio.subprocess.PIPE
         proxy = await asyncio.create_subprocess_exec(*command, cwd=ROOT, stdin=pipe, stdout=pipe)
@@ -165,7 +176,7 @@ class Storm:
         await proxy.stdout.readline()
         try:
             async with Supervisor(local_programs(self._directory), self._folder / "logs") as supervisor:
-                weather = Weather(self._seed, supervisor, proxy, self._crash, self._lo)
+                weather = Weather(self._seed, supervisor, proxy, self._crash, self._lo, ports)
                 loop = asyncio.get_running_loop()
                 before, end = _sockets(supervisor), loop.time() + seconds
                 blowing = loop.create_task(weather.blow())
@@ -235,9 +246,11 @@ class Storm:
                 self._faults.append(f"{kept} hangs")
                 return False
             kills += code == -signal.SIGKILL
-            if not _records(kept):
+            if not _stimuli(kept):
                 self._unborn += 1
                 return False
+            if (result := next(kept.glob(f"*/{RESULT}"), None)) is not None and code == -signal.SIGKILL:
+                code = 0 if json.loads(result.read_text(encoding="utf-8"))["status"] == "success" else 1
             if code != -signal.SIGKILL and code != UNREACHABLE:
                 break
             self._resumes += 1
@@ -246,13 +259,13 @@ class Storm:
 
     async def _life(self, given: list[str], kept: Path, until: float, *, mortal: bool) -> int:
         """One life of the coordinator: its exit code, -9 if the weather has killed it (once it had something to lose)."""
-        before = _records(kept)
+        before = _stimuli(kept)
         ports = ",".join(map(str, self._proxied))
         with (self._folder / "coordinator.txt").open("ab") as out:
             command = [sys.executable, "-m", "tests.chaos.by_proxy", ports, *given]
             process = await asyncio.create_subprocess_exec(*command, cwd=ROOT, stdout=out, stderr=out)
         ending = asyncio.ensure_future(process.wait())
-        while not ending.done() and _records(kept) <= before + 1 and asyncio.get_running_loop().time() < until:
+        while not ending.done() and _stimuli(kept) == before and asyncio.get_running_loop().time() < until:
             await beat(0.02)
         self._crash.clear()
         crashing = asyncio.ensure_future(self._crash.wait())
@@ -303,6 +316,16 @@ class Storm:
         return all(r.status is Status.SUCCESS for r in records)
 
 
+async def _listens(port: int) -> bool:
+    """Whether a node takes connections there."""
+    with contextlib.suppress(OSError, TimeoutError):
+        async with asyncio.timeout(0.5):
+            _, writer = await asyncio.open_connection("127.0.0.1", port)
+            writer.transport.abort()
+            return True
+    return False
+
+
 def _signal(process: int, number: signal.Signals) -> None:
     if process:
         with contextlib.suppress(ProcessLookupError):
@@ -325,11 +348,11 @@ def _sockets(supervisor: Supervisor) -> dict[str, int]:
     return counts
 
 
-def _records(kept: Path) -> int:
-    """How many records the journal of a mission run holds behind its header; 0 while there is none."""
+def _stimuli(kept: Path) -> int:
+    """How many stimuli the journal of a mission run holds; 0 while it has not begun."""
     journal = next(kept.glob(f"*/{JOURNAL}"), None)
     try:
-        return len(read_journal(journal).records) if journal is not None else 0
+        return sum(r.kind == STIMULUS for r in read_journal(journal).records) if journal is not None else 0
     except JournalError:
         return 0
 

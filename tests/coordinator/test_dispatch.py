@@ -172,6 +172,9 @@ def test_a_run_sent_to_another_boot_is_asked_for_by_that_boot_and_never_run_agai
     assert isinstance(call, m.Call) and (call.id, call.boot) == (WORK, "n1")
     bench.say(2.1, m.Outcome(WORK, "error", {}, "rebooted", "", m.Executed.UNKNOWN))
     assert bench.fired == ["failed"]
+    bench.go(2.1 + 0.9 * STOP_MARGIN)
+    assert bench.calls() == [], "the former process's arm may still be at its stop routine"
+    bench.go(2.1 + STOP_MARGIN)
     (tidy,) = bench.sent(m.Call)
     assert isinstance(tidy, m.Call) and (tidy.id, tidy.boot) == (TIDY, "n2"), "later runs go to whoever is there"
 
