@@ -109,24 +109,6 @@ export function pips(count) {
   ][count] ?? null;
 }
 
-const STEEP = Math.cos((38 * Math.PI) / 180);
-
-/** Where an element's label stands free of its arcs: below, else above, right or left of it. */
-export function labelSide(element, curves) {
-  const blocked = new Set();
-  for (const c of curves) {
-    for (const [x, y] of [[c[0], c[1]], [c[4], c[5]]]) {
-      const [dx, dy] = [x - element.x, y - element.y];
-      const length = Math.hypot(dx, dy) || 1;
-      if (length > PLACE_R + 8 || (element.shape !== "place" && length > BAR_H / 2 + 8)) continue;
-      if (dy / length > STEEP) blocked.add("below");
-      if (-dy / length > STEEP) blocked.add("above");
-      if (Math.abs(dx) / length > 0.3) blocked.add(dx > 0 ? "right" : "left");
-    }
-  }
-  return ["below", "above", "right", "left"].find((side) => !blocked.has(side)) ?? "below";
-}
-
 /** Positions of label and caption for a side: [x, y of label, y of caption, text-anchor]. */
 export function labelAt(element, side) {
   const isPlace = element.shape === "place";

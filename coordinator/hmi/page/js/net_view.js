@@ -1,9 +1,10 @@
 // Draws one net as SVG and alters only what changed. Shared by the live view, the designer and the history.
 
 import { attribute, s, text, words } from "./dom.js";
-import { at, BAR_H, BAR_W, bounds, labelAt, labelSide, path, pips, PLACE_R, route } from "./geometry.js";
+import { at, BAR_H, BAR_W, bounds, labelAt, path, pips, PLACE_R, route } from "./geometry.js";
 import { Flights } from "./flights.js";
 import { iconPath } from "./icons.js";
+import { Ground } from "./labels.js";
 
 const KIND_WORD = { action: "Action place", resource: "Resource place", control: "Control place", macro: "Macro place" };
 const LABEL_MOST = 24;
@@ -129,8 +130,10 @@ export class NetView {
 
   describe(element) {
     const { parts } = element;
-    text(parts.label, short(words(element.label || element.name)));
-    text(parts.sub, short(element.sub ?? ""));
+    element.said = short(words(element.label || element.name));
+    element.subSaid = short(element.sub ?? "");
+    text(parts.label, element.said);
+    text(parts.sub, element.subSaid);
     text(parts.title, element.hint ?? element.name);
     this.name(element);
     attribute(element.node, "data-error", element.error ? "" : null);
@@ -165,17 +168,14 @@ export class NetView {
     this.label(this.elements.keys());
   }
 
-  /** Put labels where no arc of their element runs through them. */
+  /** Put labels where they cover nothing, as far as there is such a place. */
   label(names) {
-    const curves = new Map();
-    for (const arc of this.arcs.values()) {
-      if (this.isFolded(this.elements.get(arc.place)) || this.isFolded(this.elements.get(arc.transition))) continue;
-      for (const name of [arc.place, arc.transition]) curves.has(name) ? curves.get(name).push(arc.curve) : curves.set(name, [arc.curve]);
-    }
-    for (const name of names) {
-      const element = this.elements.get(name);
-      if (!element) continue;
-      const side = labelSide(element, curves.get(name) ?? []);
+    const shown = (name) => !this.isFolded(this.elements.get(name));
+    const labelled = [...names].map((name) => this.elements.get(name)).filter((e) => e && !this.isFolded(e));
+    for (const element of labelled) element.boxes = null;
+    const ground = new Ground([...this.elements.values()].filter((e) => !this.isFolded(e)), [...this.arcs.values()].filter((a) => shown(a.place) && shown(a.transition)));
+    for (const element of labelled) {
+      const side = ground.settle(element);
       const [x, y, below, anchor] = labelAt(element, side);
       const { label, sub } = element.parts;
       attribute(label, "x", x);
@@ -369,7 +369,7 @@ export class NetView {
 
   resized() {
     const { clientWidth: w, clientHeight: h } = this.svg;
-    if (!this.size && w && this.elements.size) this.fit();
+    if ((!this.size || this.view === this.fitted) && w && this.elements.size) this.fit(); // nobody has moved or zoomed it
     this.size = [w, h];
     this.events.moved?.(this);
   }
@@ -381,6 +381,7 @@ export class NetView {
     const top = 46; // the bar lies over the drawing
     const zoom = Math.max(ZOOM[0], Math.min(1.5, (w - 24) / (box[2] - box[0]), (h - top - 12) / (box[3] - box[1])));
     this.look((w - (box[0] + box[2]) * zoom) / 2, top + (h - top - (box[1] + box[3]) * zoom) / 2, zoom);
+    this.fitted = this.view;
   }
 
   look(x, y, zoom) {
