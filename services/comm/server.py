@@ -67,7 +67,7 @@ class _ServerLink(Link):
                 self.frames.append(frame)
                 if len(self.frames) >= at_once:
                     self.write()
-                callee.keep(now, peer, answer, len(frame))
+                callee.keep(now, peer, answer, len(frame) or None)
             elif isinstance(message, Hello):
                 self._greet(now, message)
                 peer = self.peer
@@ -85,10 +85,10 @@ class _ServerLink(Link):
         try:
             return answer, self.connection.send(answer)
         except ProtocolError as fault:
+            if self.connection.state is not State.OPEN:
+                return answer, b""  # its last word came with the call: it may ask again when it is back
             answer = _bad_result(answer, fault)
-            # Its last word may have come with the call: then nobody listens any more.
-            frame = self.connection.send(answer) if self.connection.state is State.OPEN else b""
-            return answer, frame
+            return answer, self.connection.send(answer)
 
     def beaten(self, now: float, count: int) -> bool:
         self._taken += count

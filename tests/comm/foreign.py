@@ -1,0 +1,205 @@
+"""A client of the node protocol that knows nothing but docs/protocol.md: sockets and the standard library, no line of services.
+
+Its msgpack is its own, too (https://github.com/msgpack/msgpack/blob/master/spec.md): what it needs of it, written out.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import secrets
+import socket
+import struct
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+HELLO, WELCOME, REFUSE, CALL, ACCEPT, FEEDBACK, RESULT, RESULT_ACK, CANCEL, EVENT, EVENT_ACK, SUBSCRIBE = range(1, 13)
+COMMAND, ANSWER, PING, PONG, TICK, BYE, CHALLENGE, PROOF, STREAM_OPEN, SET_POINT, WITHDRAW = range(13, 24)
+LIMIT = 10.0
+"""Seconds that anything may take."""
+
+
+def pack(value: Any) -> bytes:
+    """msgpack of plain data."""
+    if value is None or isinstance(value, bool):
+        return {None: b"\xc0", False: b"\xc2", True: b"\xc3"}[value]
+    if isinstance(value, float):
+        return b"\xcb" + struct.pack(">d", value)
+    if isinstance(value, int):
+        return bytes([value]) if 0 <= value < 128 else b"\xcf" + struct.pack(">Q", value)
+    if isinstance(value, str):
+        text = value.encode()
+        return (bytes([0xA0 | len(text)]) if len(text) < 32 else b"\xdb" + struct.pack(">I", len(text))) + text
+    if isinstance(value, bytes):
+        return b"\xc6" + struct.pack(">I", len(value)) + value
+    if isinstance(value, Mapping):
+        pairs = b"".join(pack(key) + pack(item) for key, item in value.items())
+        return (bytes([0x80 | len(value)]) if len(value) < 16 else b"\xdf" + struct.pack(">I", len(value))) + pairs
+    items = b"".join(pack(item) for item in value)
+    return (bytes([0x90 | len(value)]) if len(value) < 16 else b"\xdd" + struct.pack(">I", len(value))) + items
+
+
+_NUMBERS = {
+    0xCA: ">f", 0xCB: ">d", 0xCC: ">B", 0xCD: ">H", 0xCE: ">I", 0xCF: ">Q", 0xD0: ">b", 0xD1: ">h", 0xD2: ">i", 0xD3: ">q",
+}  # fmt: skip
+_SIZED = {0xC4: (1, "bin"), 0xC5: (2, "bin"), 0xC6: (4, "bin"), 0xD9: (1, "str"), 0xDA: (2, "str"), 0xDB: (4, "str")}
+_SIZED |= {0xDC: (2, "array"), 0xDD: (4, "array"), 0xDE: (2, "map"), 0xDF: (4, "map")}
+
+
+class Unpacking:
+    """Reads msgpack."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.at = data, 0
+
+    def _bytes(self, size: int) -> bytes:
+        self.at += size
+        assert self.at <= len(self.data), "the body is cut off"
+        return self.data[self.at - size : self.at]
+
+    def value(self) -> Any:
+        """The next value."""
+        head = self._bytes(1)[0]
+        if head < 0x80 or head >= 0xE0:
+            return head if head < 0x80 else head - 256
+        if head < 0xC0:
+            kind, size = (
+                ("map", head & 15) if head < 0x90 else ("array", head & 15) if head < 0xA0 else ("str", head & 31)
+            )
+            return self._sized(kind, size)
+        if head in (0xC0, 0xC2, 0xC3):
+            return {0xC0: None, 0xC2: False, 0xC3: True}[head]
+        if head in _NUMBERS:
+            return struct.unpack(_NUMBERS[head], self._bytes(struct.calcsize(_NUMBERS[head])))[0]
+        width, kind = _SIZED[head]
+        return self._sized(kind, int.from_bytes(self._bytes(width), "big"))
+
+    def _sized(self, kind: str, size: int) -> Any:
+        if kind == "str":
+            return self._bytes(size).decode()
+        if kind == "bin":
+            return self._bytes(size)
+        if kind == "array":
+            return [self.value() for _ in range(size)]
+        return {self.value(): self.value() for _ in range(size)}
+
+
+def unpack(body: bytes) -> list[Any]:
+    """The array of a body, whole: a fixarray whose first element is a positive fixint."""
+    assert 0x91 <= body[0] <= 0x9F and body[1] < 0x80, body[:2].hex()
+    reading = Unpacking(body)
+    found = reading.value()
+    assert reading.at == len(body), "something follows the message"
+    assert isinstance(found, list)
+    return found
+
+
+class Foreign:
+    """One connection. `key` is the shared key of 32 bytes."""
+
+    def __init__(self, address: tuple[str, int], key: bytes | None = None) -> None:
+        self.socket = socket.create_connection(address, LIMIT)
+        self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.key = key
+        self.seal_out = self.seal_in = b""
+        self.sent = self.heard = 0
+        """Frames sealed in each direction."""
+        self.skipped: list[list[Any]] = []
+        """What came while something else was waited for."""
+
+    # --- frames
+
+    def frame(self, body: bytes) -> bytes:
+        """A body with its length, and with its seal once the connection is open and has a key."""
+        seal = b""
+        if self.seal_out:
+            seal = hmac.digest(self.seal_out, struct.pack(">Q", self.sent) + body, "sha256")[:16]
+            self.sent += 1
+        return struct.pack(">I", len(body) + len(seal)) + body + seal
+
+    def say(self, *message: Any) -> None:
+        """Send a message: kind and fields."""
+        self.raw(self.frame(pack(message)))
+
+    def raw(self, data: bytes) -> None:
+        """Send bytes as they are."""
+        self.socket.sendall(data)
+
+    def _exactly(self, size: int) -> bytes:
+        data = b""
+        while len(data) < size:
+            more = self.socket.recv(size - len(data))
+            if not more:
+                raise ConnectionError("the node hung up")
+            data += more
+        return data
+
+    def body(self) -> bytes:
+        """The next frame's body, its seal checked."""
+        body = self._exactly(int.from_bytes(self._exactly(4), "big"))
+        if self.seal_in:
+            body, seal = body[:-16], body[-16:]
+            assert seal == hmac.digest(self.seal_in, struct.pack(">Q", self.heard) + body, "sha256")[:16]
+            self.heard += 1
+        return body
+
+    def hear(self) -> list[Any]:
+        """The next message that is no heartbeat; a PING is answered as the page says. Raises TimeoutError."""
+        until = time.monotonic() + LIMIT
+        while time.monotonic() < until:
+            message = unpack(self.body())
+            if message[0] == PING:
+                self.say(PONG, message[1])
+            elif message[0] != PONG:
+                return message
+        raise TimeoutError(f"nothing but heartbeats for {LIMIT} s; before came {self.skipped[-5:]}")
+
+    def expect(self, kind: int, *start: Any) -> list[Any]:
+        """The next message of a kind whose fields begin so. Raises TimeoutError."""
+        until = time.monotonic() + LIMIT
+        while True:
+            for message in self.skipped:
+                if message[0] == kind and message[1 : 1 + len(start)] == list(start):
+                    self.skipped.remove(message)
+                    return message
+            if time.monotonic() > until:
+                raise TimeoutError(f"no {kind} {start} came, but {self.skipped[-5:]}")
+            self.skipped.append(self.hear())
+
+    # --- the opening
+
+    def open(
+        self,
+        role: str,
+        name: str,
+        boot: str = "f1",
+        epoch: int = 0,
+        directory: str = "",
+        versions: Sequence[int] = (1, 1),
+    ) -> list[Any]:
+        """HELLO to WELCOME; gives WELCOME, or the REFUSE that came in its place."""
+        auth = secrets.token_bytes(32) if self.key is not None else b""
+        hello = pack([HELLO, *versions, role, name, boot, epoch, directory, auth])
+        self.raw(self.frame(hello))
+        body = self.body()
+        if self.key is None or body[1] == REFUSE:
+            return unpack(body)
+        assert body[1] == CHALLENGE and len(unpack(body)[1]) == 32
+        transcript = hello + body
+        self.say(PROOF, self._hmac(b"client\0" + transcript))
+        body = self.body()
+        message = unpack(body)
+        if message[0] == WELCOME:
+            assert message[7] == self._hmac(b"server\0" + transcript + body[:-32]), "the node does not know the key"
+            self.seal_out = self._hmac(b"client to server\0" + transcript)
+            self.seal_in = self._hmac(b"server to client\0" + transcript)
+        return message
+
+    def _hmac(self, data: bytes) -> bytes:
+        assert self.key is not None
+        return hmac.new(self.key, data, hashlib.sha256).digest()
+
+    def close(self) -> None:
+        """Hang up without a word."""
+        self.socket.close()

@@ -1,0 +1,391 @@
+"""docs/protocol.md is enough to talk to a node: a client written from the page alone, against real node processes.
+
+The location file is a real one, read by `python -m services`: a node with the global memory, actions in worker processes, a
+device that takes a set-point stream, and a timer; once on loopback without, once with a shared key.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.comm import foreign as f
+from tests.comm.foreign import Foreign, pack
+
+pytestmark = pytest.mark.processes
+ROOT = Path(__file__).parents[2]
+PLACES = """\
+schema = 1
+[nodes.hub]
+host = "127.0.0.1"
+port = {port}
+[devices.slide]
+node = "hub"
+driver = "toy_cell.drivers:Slide"
+period = 0.004
+speed = 4.0
+[streams.points]
+to = "slide"
+period = 0.02
+[timers.beat]
+node = "hub"
+period = 0.02
+[services.memory]
+node = "hub"
+[actions]
+go = {{ run = "toy_cell.actions:go", task = "move", device = "slide" }}
+follow = {{ run = "toy_cell.actions:follow", task = "move", device = "slide" }}
+add = {{ run = "toy_cell.actions:add", task = "sum", node = "hub" }}
+nap = {{ run = "toy_cell.actions:nap", task = "sum", node = "hub" }}
+"""
+
+
+@dataclass
+class Hub:
+    """A node process."""
+
+    address: tuple[str, int]
+    key: bytes | None
+    opened: list[Foreign]
+    count: int = 0
+
+    def knock(self) -> Foreign:
+        """A connection that has said nothing."""
+        self.opened.append(Foreign(self.address, self.key))
+        return self.opened[-1]
+
+    def coordinator(self, name: str = "") -> Foreign:
+        """A connection of a coordinator of its own, welcome."""
+        self.count += 1
+        client = self.knock()
+        assert client.open("coordinator", name or f"foreign{self.count}", epoch=1)[0] == f.WELCOME
+        return client
+
+
+def launched(folder: Path, key: bytes | None) -> tuple[subprocess.Popen[str], tuple[str, int]]:
+    """The node, ready."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = int(probe.getsockname()[1])
+    text = PLACES.format(port=port)
+    if key is not None:
+        file = folder / "cell.key"
+        file.touch(0o600)
+        file.write_text(key.hex() + "\n")
+        text += '[keys]\nfile = "cell.key"\n'
+    (folder / "services.toml").write_text(text, encoding="utf-8")
+    path = os.pathsep.join([str(ROOT), str(ROOT / "tests" / "node" / "outside")])
+    process = subprocess.Popen(
+        [sys.executable, "-m", "services", "hub", "--services", str(folder / "services.toml")],
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": path},
+    )
+    assert process.stdout is not None
+    assert "ready" in process.stdout.readline()
+    return process, ("127.0.0.1", port)
+
+
+@pytest.fixture(scope="module", params=[None, bytes(range(32))], ids=["no key", "shared key"])
+def process(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hub]:
+    """A node that all tests of this page share."""
+    node, address = launched(tmp_path_factory.mktemp("hub"), request.param)
+    yield Hub(address, request.param, [])
+    node.terminate()
+    node.communicate(timeout=20.0)
+
+
+@pytest.fixture
+def hub(process: Hub) -> Iterator[Hub]:
+    """The same, its connections closed after each test."""
+    yield process
+    for one in process.opened:
+        one.close()
+    process.opened.clear()
+
+
+def result_of(client: Foreign, id_: str, service: str, arguments: dict[str, Any], *more: Any) -> list[Any]:
+    """CALL to RESULT, acknowledged."""
+    client.say(f.CALL, id_, service, arguments, *more)
+    result = client.expect(f.RESULT, id_)
+    client.say(f.RESULT_ACK, id_)
+    return result
+
+
+def test_the_bytes_of_the_page() -> None:
+    """Both examples, made by a client that has its own msgpack."""
+    client = Foreign.__new__(Foreign)
+    client.seal_out = b""
+    assert client.frame(pack((f.PING, 1))) == bytes.fromhex("000000 03 92 0f 01")
+    call = client.frame(pack((f.CALL, "c1", "track", {"t": 1.5}, 2.0, 3, "b1", "p0", 7)))
+    page = (ROOT / "docs" / "protocol.md").read_text(encoding="utf-8").split("parent `p0`, seed 7:\n```\n")[1]
+    shown = [line.partition("  ")[0] for line in page.split("```")[0].splitlines()]
+    assert call == bytes.fromhex(" ".join(shown))
+
+
+def test_hello_and_welcome(hub: Hub) -> None:
+    client = hub.knock()
+    _, version, name, boot, offers, runs, directory, auth = client.open("client", "guest")
+    assert (version, name, runs) == (1, "hub", []) and boot and len(directory) > 8
+    assert {"go", "add", "nap", "memory.get", "memory.put", "stream:points"} <= set(offers)
+    assert len(auth) == (0 if hub.key is None else 32)
+
+
+def test_a_service_answered_on_the_spot_sends_a_result_without_accept(hub: Hub) -> None:
+    client = hub.coordinator()
+    name = f"at {hub.count}"
+    client.say(f.CALL, f"{name}/1", "memory.put", {"name": name, "value": [1, 2.5, b"b", None, {"x": True}]}, 1.0, 1)
+    kind, id_, status, values, cause, text, executed, seconds, cpu = client.hear()
+    assert (kind, id_, status, values, cause, text, executed) == (
+        f.RESULT, f"{name}/1", "success", {"version": 1}, "", "", "yes",
+    )  # fmt: skip
+    assert seconds >= 0.0 and cpu >= 0.0
+    found = result_of(client, f"{name}/2", "memory.get", {"name": name}, None, 1)
+    assert found[3] == {"value": [1, 2.5, b"b", None, {"x": True}], "version": 1}
+    client.say(f.BYE)
+
+
+def test_an_action_accept_result_and_at_most_once(hub: Hub) -> None:
+    """A known id is answered from what is known: its stored result, and `forgotten` once that was acknowledged."""
+    client = hub.coordinator()
+    id_ = f"once {hub.count}"
+    client.say(f.CALL, id_, "add", {"a": 2, "b": 3}, 5.0, 1)
+    assert client.hear() == [f.ACCEPT, id_]
+    first = client.hear()
+    assert first[:4] == [f.RESULT, id_, "success", {"sum": 5}]
+    client.say(f.CALL, id_, "add", {"a": 2, "b": 3}, 5.0, 1)
+    assert client.hear() == first, "the same result, the seconds that it took included"
+    client.say(f.RESULT_ACK, id_, ["another"])
+    client.say(f.CALL, id_, "add", {"a": 2, "b": 3}, 5.0, 1)
+    assert client.hear()[2:7:2] == ["error", "forgotten", "unknown"]
+
+
+def test_what_was_lost_with_the_link_is_listed_and_given_again(hub: Hub) -> None:
+    """WELCOME names the runs that go on or are not acknowledged; the same CALL brings ACCEPT or the result."""
+    client = hub.coordinator()
+    name = f"foreign{hub.count}"
+    client.say(f.CALL, f"{name}/done", "add", {"a": 1}, 5.0, 1)
+    client.expect(f.RESULT, f"{name}/done")
+    client.say(f.CALL, f"{name}/on", "nap", {"seconds": 0.4}, 5.0, 1)
+    client.expect(f.ACCEPT, f"{name}/on")
+    client.close()
+    again = hub.knock()
+    runs = again.open("coordinator", name, epoch=1)[5]
+    assert set(runs) == {f"{name}/done", f"{name}/on"}
+    again.say(f.CALL, f"{name}/on", "nap", {"seconds": 0.4}, 5.0, 1)
+    assert again.expect(f.RESULT, f"{name}/on")[3] == {"slept": 0.4}
+    again.say(f.CALL, f"{name}/done", "add", {"a": 1}, 5.0, 1)
+    assert again.expect(f.RESULT, f"{name}/done")[3] == {"sum": 2}
+
+
+def test_cancel_and_deadline(hub: Hub) -> None:
+    """CANCEL always leads to a RESULT; one that overtakes its CALL keeps it from beginning."""
+    client = hub.coordinator()
+    name = f"foreign{hub.count}"
+    client.say(f.CALL, f"{name}/1", "nap", {"seconds": 30.0}, 60.0, 1)
+    client.expect(f.ACCEPT, f"{name}/1")
+    client.say(f.CANCEL, f"{name}/1", "no more")
+    result = client.expect(f.RESULT, f"{name}/1")
+    assert result[2:5:2] == ["error", "cancelled"] and result[6] in ("yes", "no"), (
+        "it may not have begun in its worker yet"
+    )
+    client.say(f.CANCEL, f"{name}/2")
+    assert client.expect(f.RESULT, f"{name}/2")[2:7:2] == ["error", "cancelled", "no"]
+    client.say(f.CALL, f"{name}/2", "nap", {"seconds": 30.0}, 60.0, 1)
+    assert client.expect(f.RESULT, f"{name}/2")[2:7:2] == ["error", "cancelled", "no"]
+    client.say(f.CALL, f"{name}/3", "nap", {"seconds": 30.0}, 0.05, 1)
+    assert client.expect(f.RESULT, f"{name}/3")[2:7:2] == ["error", "deadline", "yes"]
+
+
+@pytest.mark.parametrize(
+    ("service", "more", "cause", "executed"),
+    [
+        ("no_such", (None, 1), "unknown_service", "no"),
+        ("add", (None, 0), "old_epoch", "no"),
+        ("add", (1.0, 1, "another boot"), "rebooted", "unknown"),
+    ],
+)
+def test_what_is_refused_is_a_result(hub: Hub, service: str, more: tuple[Any, ...], cause: str, executed: str) -> None:
+    client = hub.coordinator()
+    result = result_of(client, f"{cause} {hub.count}", service, {"a": 1}, *more)
+    assert result[2:7:2] == ["error", cause, executed] and result[5]
+
+
+def test_one_caller_at_a_time_holds_a_device(hub: Hub) -> None:
+    """The lease is given up with BYE; until then nobody else's orders are taken."""
+    first, second = hub.coordinator(), hub.coordinator()
+    assert result_of(first, f"lease {hub.count}", "go", {"to": 0.0}, 5.0, 1)[2] == "success"
+    assert result_of(second, f"lease {hub.count}b", "go", {"to": 0.0}, 5.0, 1)[4] == "device_leased"
+    first.say(f.BYE, "enough")
+    assert first.socket.recv(1) == b"", "the node hangs up, too"
+    assert result_of(second, f"lease {hub.count}c", "go", {"to": 0.0}, 5.0, 1)[2] == "success"
+    second.say(f.BYE)
+
+
+def test_heartbeats(hub: Hub) -> None:
+    """PING is answered; the node asks when it hears nothing, and cuts off one that stays silent."""
+    client = hub.coordinator()
+    client.say(f.PING, 2**63 - 1)
+    assert f.unpack(client.body()) == [f.PONG, 2**63 - 1]
+    assert f.unpack(client.body())[0] == f.PING
+    with pytest.raises(ConnectionError):
+        while True:
+            assert f.unpack(client.body())[0] == f.PING
+
+
+def test_events_and_commands(hub: Hub) -> None:
+    """Pulses of a timer; latched events of the memory, sent until they are acknowledged; a command and its answer."""
+    client = hub.coordinator()
+    name = f"value {hub.count}"
+    client.say(f.SUBSCRIBE, ["beat"])
+    assert client.expect(f.EVENT, "beat")[3] == 0
+    client.say(f.COMMAND, "c1", "status")
+    _, id_, ok, data = client.expect(f.ANSWER)
+    assert (id_, ok) == ("c1", True) and "position" in data["devices"]["slide"]["state"]
+    client.say(f.COMMAND, "c2", "stop", "slide")
+    assert client.expect(f.ANSWER, "c2")[3]["answers"]["slide"] in ("stopped", "stopping")
+    client.say(f.SUBSCRIBE, [f"memory:{name}"])
+    result_of(client, f"put {name}", "memory.put", {"name": name, "value": 1}, None, 1)
+    event = client.expect(f.EVENT, f"memory:{name}")
+    assert event[3] > 0 and event[4]["value"] == 1
+    client.say(f.EVENT_ACK, event[2], event[3])
+
+
+def test_set_points(hub: Hub) -> None:
+    """The service of the stream says where to and gives the ticket; the device follows what is sent, and stops with WITHDRAW."""
+    client = hub.coordinator()
+    there = result_of(client, f"stream {hub.count}", "stream:points", {}, None, 1)[3]
+    stream = Foreign((there["host"], there["port"]), hub.key)
+    hub.opened.append(stream)
+    assert stream.open("stream", "hub")[0] == f.WELCOME
+    stream.say(f.STREAM_OPEN, "points", 0.02, there["ticket"])
+    client.say(f.CALL, f"follow {hub.count}", "follow", {"seconds": 0.6}, 5.0, 1)
+    begun, number = time.monotonic(), 0
+    while time.monotonic() < begun + 0.5:
+        number += 1
+        stream.say(f.SET_POINT, number, [0.2 * number / 25], 0.0, time.monotonic() - begun)
+        due = begun + 0.02 * number
+        while (left := due - time.monotonic()) > 0:
+            stream.socket.settimeout(max(left, 1e-4))
+            try:
+                stream.hear()
+            except TimeoutError:
+                continue
+    stream.say(f.WITHDRAW)
+    end = client.expect(f.RESULT, f"follow {hub.count}")
+    assert end[2] == "success" and end[3]["count"] > 5 and end[3]["position"] != 0.0
+    client.say(f.BYE)
+
+
+# --- what breaks the protocol -----------------------------------------------------------------------------------------------
+
+
+OPENING: list[tuple[str, Callable[[Foreign], None]]] = [
+    ("malformed", lambda one: one.raw(one.frame(pack((f.HELLO, 1, 1, "client", "bad"))))),
+    ("malformed", lambda one: one.raw(bytes.fromhex("00000001 91"))),
+    ("unknown_kind", lambda one: one.raw(one.frame(pack((77, 1))))),
+    ("unknown_kind", lambda one: one.raw(bytes.fromhex("00000002 dc 00"))),
+    ("out_of_turn", lambda one: one.raw(one.frame(pack((f.CALL, "1", "add"))))),
+    ("too_large", lambda one: one.raw(bytes.fromhex("00001001 99 01"))),
+]
+OPEN: list[tuple[str, Callable[[Foreign], None]]] = [
+    ("malformed", lambda one: one.say(f.CALL, 1, "add")),
+    ("malformed", lambda one: one.say(f.CALL, "x" * 256, "add")),
+    ("malformed", lambda one: one.say(f.CALL, "1", "add", {}, -1.0)),
+    ("malformed", lambda one: one.say(f.CALL, "1", "add", {}, float("nan"))),
+    ("malformed", lambda one: one.say(f.CALL, "1", "add", {}, None, 2**63)),
+    ("malformed", lambda one: one.say(f.CALL, "1", "add", {}, None, 0, "", "", 0, 0)),
+    ("malformed", lambda one: one.raw(one.frame(b"\x94\x04\xa11\xa3add\x81\x01\x01"))),
+    ("malformed", lambda one: one.raw(one.frame(b"\x94\x04\xa11\xa3add\x81\xc4\x01a\x01"))),
+    ("malformed", lambda one: one.raw(one.frame(b"\x94\x04\xa11\xa3add\x81\xa1t\xd6\xff\x00\x00\x00\x01"))),
+    ("malformed", lambda one: one.raw(one.frame(b"\x94\x04\xa11\xa3add\x81\xa1x" + b"\x91" * 33 + b"\xc0"))),
+    ("malformed", lambda one: one.raw(one.frame(pack((f.PING, 1)) + b"\xc0"))),
+    ("too_large", lambda one: one.raw((33 + 16 * bool(one.key)).to_bytes(4, "big") + b"\x92\x0f")),
+    ("unknown_kind", lambda one: one.say(0)),
+    ("out_of_turn", lambda one: one.say(f.RESULT, "1", "success")),
+    ("out_of_turn", lambda one: one.say(f.HELLO, 1, 1, "client", "x", "y")),
+]
+
+
+@pytest.mark.parametrize(("code", "do"), OPENING, ids=lambda value: value if isinstance(value, str) else "")
+def test_a_bad_frame_while_opening_is_refused_by_its_code(hub: Hub, code: str, do: Callable[[Foreign], None]) -> None:
+    client = hub.knock()
+    do(client)
+    assert f.unpack(client.body())[:2] == [f.REFUSE, code]
+    assert client.socket.recv(1) == b""
+
+
+@pytest.mark.parametrize(("code", "do"), OPEN, ids=lambda value: value if isinstance(value, str) else "")
+def test_a_bad_frame_while_open_is_refused_by_its_code(hub: Hub, code: str, do: Callable[[Foreign], None]) -> None:
+    """Sealed like every frame of an open connection. What came before it was done, and its result is there for who comes back."""
+    client, name = hub.coordinator(), f"foreign{hub.count}"
+    call: tuple[Any, ...] = (f.CALL, f"{name}/before", "memory.list", {}, None, 1)
+    client.raw(client.frame(pack(call)))
+    do(client)
+    refuse = client.expect(f.REFUSE)
+    assert refuse[1] == code and refuse[2]
+    assert client.socket.recv(1) == b""
+    again = hub.knock()
+    assert again.open("coordinator", name, epoch=1)[5] == [f"{name}/before"]
+    again.say(*call)
+    result = again.expect(f.RESULT, f"{name}/before")
+    assert (result[2], list(result[3]), result[4]) == ("success", ["versions"], "")
+
+
+@pytest.mark.parametrize("versions", [(2, 9), (3, 2)])
+def test_versions_that_do_not_meet(hub: Hub, versions: tuple[int, int]) -> None:
+    assert hub.knock().open("client", "old", versions=versions)[:2] == [f.REFUSE, "version"]
+
+
+def test_the_range_of_a_newer_client_is_met(hub: Hub) -> None:
+    assert hub.knock().open("client", f"newer {hub.count}", versions=(0, 9))[:2] == [f.WELCOME, 1]
+
+
+def test_names_epochs_and_directories(hub: Hub) -> None:
+    """One process a name; a replaced coordinator is told so; another location file is refused."""
+    first = hub.knock()
+    assert first.open("coordinator", "chief", "boot 1", epoch=5)[0] == f.WELCOME
+    assert hub.knock().open("coordinator", "chief", "boot 2", epoch=5)[:2] == [f.REFUSE, "name_taken"]
+    assert hub.knock().open("coordinator", "chief", "boot 2", epoch=4)[:2] == [f.REFUSE, "old_epoch"]
+    assert hub.knock().open("coordinator", "chief", "boot 2", epoch=6)[0] == f.WELCOME
+    assert hub.knock().open("client", "elsewhere", directory="0" * 64)[:2] == [f.REFUSE, "directory"]
+
+
+def test_keys_that_do_not_fit(hub: Hub) -> None:
+    """Each refusal by its code, whichever side has which key."""
+    wrong = Foreign(hub.address, None if hub.key is not None else bytes(32))
+    hub.opened.append(wrong)
+    assert wrong.open("client", "w")[:2] == [f.REFUSE, "key_needed" if hub.key is not None else "no_key_here"]
+    if hub.key is not None:
+        other = Foreign(hub.address, bytes(32))
+        hub.opened.append(other)
+        assert other.open("client", "w")[:2] == [f.REFUSE, "wrong_key"]
+
+
+@pytest.mark.parametrize("fault", ["changed", "repeated", "left out", "unsealed"])
+def test_a_broken_seal_ends_the_connection(hub: Hub, fault: str) -> None:
+    if hub.key is None:
+        return
+    client = hub.coordinator()
+    frame = client.frame(pack((f.PING, 1)))
+    if fault == "changed":
+        client.raw(frame[:-1] + bytes([frame[-1] ^ 1]))
+    elif fault == "repeated":
+        client.raw(frame + frame)
+    elif fault == "left out":
+        client.say(f.PING, 2)
+    else:
+        client.raw(b"\x00\x00\x00\x12" + pack((f.PING, 1)) + bytes(15))
+    message = f.unpack(client.body())
+    while message[0] in (f.PONG, f.PING):
+        message = f.unpack(client.body())
+    assert message[:2] == [f.REFUSE, "bad_seal"]

@@ -1,0 +1,218 @@
+"""The shipped cell's vision node, launched from the shipped location file, under everything that a stranger can send to it.
+
+Malformed frames by the thousand, handshakes that drip, lengths and nestings beyond all limits, bodies that never end: a good
+caller on one connection is answered throughout, a new one is let in, and the node keeps neither memory nor sockets.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import random
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tests.comm import foreign as f
+from tests.comm.foreign import Foreign, pack
+from tests.integration.cell_files import ROOT, services_file
+
+pytestmark = pytest.mark.processes
+GROWTH = 24 << 20
+"""Bytes by which the node may be larger after an attack than before."""
+MIB = 1 << 20
+
+
+@dataclass
+class Vision:
+    """The node process."""
+
+    process: subprocess.Popen[str]
+    address: tuple[str, int]
+
+    def size(self) -> int:
+        """Its resident set (bytes)."""
+        lines = Path(f"/proc/{self.process.pid}/status").read_text().splitlines()
+        return next(1024 * int(line.split()[1]) for line in lines if line.startswith("VmRSS"))
+
+    def sockets(self) -> int:
+        """How many sockets it holds."""
+        count = 0
+        for one in Path(f"/proc/{self.process.pid}/fd").iterdir():
+            with contextlib.suppress(OSError):
+                count += str(one.readlink()).startswith("socket:")
+        return count
+
+    def stranger(self) -> socket.socket:
+        """A connection of nobody."""
+        return socket.create_connection(self.address, f.LIMIT)
+
+    def good(self, name: str) -> Foreign:
+        """A caller that is welcome."""
+        client = Foreign(self.address)
+        assert client.open("client", name)[0] == f.WELCOME
+        return client
+
+
+@pytest.fixture(scope="module")
+def vision(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Vision]:
+    """`python -m services vision` on the shipped services.toml, with free ports."""
+    file = services_file(tmp_path_factory.mktemp("cell"))
+    command = [sys.executable, "-m", "services", "vision", "--services", str(file)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    assert process.stdout is not None
+    said = process.stdout.readline()
+    assert "ready on" in said
+    host, _, port = said.partition("ready on ")[2].partition(",")[0].rpartition(":")
+    yield Vision(process, (host, int(port)))
+    process.terminate()
+    process.communicate(timeout=20.0)
+
+
+def ask(client: Foreign, number: int) -> None:
+    """The good caller's question: how are you."""
+    client.say(f.COMMAND, f"ask {number}", "status")
+    answer = client.expect(f.ANSWER, f"ask {number}")
+    assert answer[2] and "camera" in answer[3]["devices"]
+
+
+def _frame(body: bytes) -> bytes:
+    return len(body).to_bytes(4, "big") + body
+
+
+def malformed(random_: random.Random) -> bytes:
+    """A connection's worth of bytes that no server may choke on."""
+    name = f"bad{random_.randrange(500)}"
+    hello = _frame(pack((f.HELLO, 1, 1, "client", name, name)))
+    call = _frame(pack((f.CALL, "1", "locate_background", {"x": [1, {"y": 2.0}]}, 1.0)))
+    spoilt = bytearray(random_.choice([hello, call]))
+    spoilt[random_.randrange(len(spoilt))] = random_.randrange(256)
+    deep = b"\x94\x04\xa1c\xa1s" + b"\x81\xa1a" * random_.randrange(33, 300) + b"\xc0"
+    wide = b"\x94\x04\xa1c\xa1s\x81\xa1a\xdd" + random_.randrange(1 << 32).to_bytes(4, "big")
+    return random_.choice(
+        [
+            random_.randbytes(random_.randrange(1, 120)),
+            bytes(spoilt),
+            hello + bytes(spoilt),
+            hello + random_.randbytes(random_.randrange(1, 300)),
+            hello + _frame(deep),
+            hello + _frame(wide),
+            hello + random_.randrange(16 * MIB + 1, 1 << 32).to_bytes(4, "big") + b"\x99\x04",
+            hello + call[: random_.randrange(len(call))],
+            hello + _frame(pack((random_.randrange(256), "x", 1))[:-1]),
+        ]
+    )
+
+
+def attack(vision: Vision, connections: int) -> None:
+    """So many connections that are no good; the good caller asks after every hundred of them."""
+    random_ = random.Random(connections)
+    good = vision.good("good")
+    ask(good, 0)
+    before, open_before = vision.size(), vision.sockets()
+    for number in range(1, connections + 1):
+        stranger = vision.stranger()
+        with contextlib.suppress(ConnectionError):
+            stranger.sendall(malformed(random_))
+            if number % 20 == 0:
+                stranger.shutdown(socket.SHUT_WR)
+                while stranger.recv(4096):
+                    pass
+        stranger.close()
+        if number % 100 == 0:
+            ask(good, number)
+    good.say(f.BYE)
+    good.close()
+    ask(after := vision.good("after"), 0)
+    while vision.sockets() > open_before:
+        ask(after, 1)
+    after.close()
+    assert vision.process.poll() is None
+    assert vision.size() - before < GROWTH
+
+
+def test_malformed_frames(vision: Vision) -> None:
+    attack(vision, 1_000)
+
+
+@pytest.mark.proof
+def test_a_hundred_thousand_malformed_frames(vision: Vision) -> None:
+    attack(vision, 100_000)
+
+
+def test_dripping_handshakes_keep_nobody_out(vision: Vision) -> None:
+    """Two hundred connections that say a byte of HELLO now and then: each is cut after its 2 s, a good caller gets in at once."""
+    hello = _frame(pack((f.HELLO, 1, 1, "client", "drip", "drip")))
+    drips = [vision.stranger() for _ in range(200)]
+    for at in range(4):
+        for one in drips:
+            with contextlib.suppress(ConnectionError):
+                one.sendall(hello[at : at + 1])
+        good = vision.good(f"between {at}")
+        ask(good, at)
+        good.say(f.BYE)
+        good.close()
+    for one in drips:
+        with contextlib.suppress(ConnectionError):
+            assert one.recv(1) == b"", "it was cut without a word"
+        one.close()
+
+
+@pytest.mark.parametrize(
+    ("body", "code"),
+    [
+        (b"\xff\xff\xff\xff\x99\x04", "too_large"),
+        ((16 * MIB + 1).to_bytes(4, "big") + b"\x99\x04", "too_large"),
+        (_frame(b"\x94\x04\xa11\xa1s" + b"\x81\xa1a" * 5_000 + b"\xc0"), "malformed"),
+        (_frame(b"\x94\x04\xa11\xa1s\x81\xa1a" + b"\x91" * 5_000 + b"\xc0"), "malformed"),
+        (_frame(b"\x94\x04\xa11\xa1s\x81\xa1a\xdd\x00\x0f\x42\x40" + b"\x90" * 1_000_000), "malformed"),
+        (_frame(b"\x94\x04\xa11\xa1s\x81\xa1a\xdd\xff\xff\xff\xff\x01"), "malformed"),
+        (_frame(b"\x94\x04\xa11\xa1s\x81\xa1a\xc6\xff\xff\xff\xff\x01"), "malformed"),
+    ],
+    ids=["4 GiB", "16 MiB and a byte", "maps", "arrays", "a million arrays", "2^32 items", "2^32 bytes"],
+)
+def test_what_is_beyond_all_limits_is_refused_and_costs_nothing(vision: Vision, body: bytes, code: str) -> None:
+    good = vision.good("steady")
+    before = vision.size()
+    for number in range(10):
+        bad = vision.good(f"huge {number}")
+        bad.raw(body)
+        assert bad.hear()[:2] == [f.REFUSE, code]
+        bad.close()
+        ask(good, number)
+    good.say(f.BYE)
+    good.close()
+    assert vision.size() - before < GROWTH
+
+
+def test_bodies_that_never_end_are_bounded(vision: Vision) -> None:
+    """Twelve callers, each with a call of 16 MiB of which the last byte never comes: the good one is answered all the while."""
+    good, open_ = vision.good("patient"), []
+    for number in range(12):
+        one = vision.good(f"endless {number}")
+        one.raw((16 * MIB).to_bytes(4, "big") + b"\x94\x04\xa11\xa1s" + bytes(2 * MIB))
+        open_.append(one)
+        ask(good, number)
+    number = 0
+    while open_:  # they are silent: each is cut after 1 s
+        number += 1
+        ask(good, 100 + number)
+        open_ = [one for one in open_ if not hung_up(one)]
+    good.close()
+
+
+def hung_up(one: Foreign) -> bool:
+    """Whether the node has ended this connection; what it said on it is thrown away."""
+    try:
+        while one.socket.recv(4096, socket.MSG_DONTWAIT):
+            pass
+    except BlockingIOError:
+        return False
+    except ConnectionError:
+        pass
+    one.close()
+    return True
