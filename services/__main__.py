@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from services.comm.directory import Directory, DirectoryError, parse, verify_imports
+from services.comm.directory import Directory, DirectoryError, parse, read_text, verify_imports
 from services.comm.directory_file import nearest
 from services.comm.lockstep import CellError
 from services.comm.lockstep_process import run_member
@@ -48,7 +48,7 @@ def parser() -> argparse.ArgumentParser:
 def read(path: Path, name: str) -> tuple[Directory, str]:
     """The location file and its text. Raises DirectoryError when it is bad or this node cannot run here."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
     except OSError as fault:
         raise DirectoryError((f"{path}: {fault.strerror}; name the file with --services",)) from fault
     directory = parse(text, path)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
 
+from coordinator.cli.becoming import become
 from coordinator.cli.loading import add_services_argument, services_path
 
 EXAMPLE = "petrobot node vision --services services.toml"
@@ -19,6 +18,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Become the node."""
-    return subprocess.call(
-        [sys.executable, "-m", "services", options.name, "--services", str(services_path(options.services))]
-    )
+    become("services", options.name, "--services", str(services_path(options.services)))

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
 
+from coordinator.cli.becoming import become
 from coordinator.cli.loading import add_services_argument, services_path
 
 EXAMPLE = "petrobot sim --services services.toml"
@@ -18,4 +17,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Become the laboratory."""
-    return subprocess.call([sys.executable, "-m", "sim", "--services", str(services_path(options.services))])
+    become("sim", "--services", str(services_path(options.services)))

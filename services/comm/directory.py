@@ -192,16 +192,21 @@ class Directory:
 def load(path: str | Path) -> Directory:
     """Read services.toml. Raises DirectoryError with every fault in it, OSError when it cannot be read."""
     source = Path(path)
+    return parse(read_text(source), source)
+
+
+def read_text(source: Path) -> str:
+    """The text of a location file. Raises DirectoryError with the line that is no UTF-8, OSError when it cannot be read."""
     try:
-        text = source.read_text(encoding="utf-8-sig")
+        return source.read_text(encoding="utf-8")
     except UnicodeDecodeError as fault:
         line = source.read_bytes()[: fault.start].count(b"\n") + 1
         raise DirectoryError((f"{source}:{line}: not UTF-8 text ({fault.reason}); save the file as UTF-8",)) from fault
-    return parse(text, source)
 
 
 def parse(text: str, source: Path) -> Directory:
     """Read the text of a services.toml; `source` is its path, for messages and for relative paths."""
+    text = text.removeprefix("\ufeff")  # some editors begin a file with a byte-order mark
     tables, digest, faults = directory_file.read(text, str(source), MEMORY)
     if faults:
         raise DirectoryError(tuple(faults))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -76,6 +77,24 @@ def test_nodes_that_are_not_there_are_exit_code_3(tmp_path: Path, capsys: pytest
     services.write_text(text, encoding="utf-8")
     assert main(["nodes", "--services", str(services), "--timeout", "0.3"]) == 3
     assert "away" in capsys.readouterr().out
+
+
+@pytest.mark.processes
+def test_a_node_ends_with_its_command(tmp_path: Path) -> None:
+    """`petrobot node` is the node, not its parent: a signal that ends the command leaves nothing that holds the port."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    services = tmp_path / "services.toml"
+    services.write_text(f'schema = 1\n[nodes.n]\nhost = "127.0.0.1"\nport = {port}\n[services.memory]\nnode = "n"\n')
+    command = [sys.executable, "-m", "coordinator", "node", "n", "--services", str(services)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2]) as node:
+        assert node.stdout is not None
+        assert node.stdout.readline() == f"node n ready on 127.0.0.1:{port}, process {node.pid}\n"
+        node.terminate()
+        assert node.wait(20.0) == 0
+    with socket.socket() as again:
+        assert again.connect_ex(("127.0.0.1", port)) != 0
 
 
 def test_check_gives_its_findings_as_json(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
