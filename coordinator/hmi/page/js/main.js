@@ -80,6 +80,7 @@ class App {
     this.tabs.Live.paint(changed, changes);
     if (["all", "controls", "connection", "mission"].some((p) => changed.has(p))) for (const tab of Object.values(this.tabs)) tab.controlsChanged?.();
     for (const change of changes) if (change.kind === "notice" && (this.shown === "Live" || change.notice.level === "error")) toast(change.notice.level, change.notice.text);
+    if (changed.has("nodes") || changed.has("all")) this.tabs.Design.nodesChanged();
     for (const change of changes) this.tabs.History.follow(change);
     if (changed.has("all")) this.tabs.History.restart();
   }

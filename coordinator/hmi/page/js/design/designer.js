@@ -59,6 +59,16 @@ export class Designer {
     this.inspector.show(this.selection, true);
   }
 
+  /** A node came or went: what can be chosen and what no node offers are other actions now. */
+  async nodesChanged() {
+    const states = JSON.stringify(Object.entries(this.link.state.nodes).map(([name, node]) => [name, node.state]));
+    if (states === this.nodeStates || this.root.hidden) return;
+    this.nodeStates = states;
+    this.offers = await loadOffers();
+    this.inspector.show(this.selection);
+    this.findings.soon();
+  }
+
   // ---- what changed -------------------------------------------------------------------------------------------------
 
   changed(why) {
