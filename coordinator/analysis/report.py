@@ -67,7 +67,7 @@ class Analysis:
         work, cannot reach its end, goes on at its end, or ends without a resource. (A transition of no use is no objection.)
         """
         named = self.verdicts()
-        against = {
+        against: dict[str, Verdict] = {
             name: named[name] for name in ("bounded", "deadlock_free", "one_run_each", "returned") if name in named
         }
         if "sound" in named and named["sound"].witness is not None:

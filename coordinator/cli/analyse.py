@@ -36,7 +36,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--states", type=int, default=5_000_000, metavar="N", help="most markings (default: %(default)s)"
     )
-    parser.add_argument("--seconds", type=float, metavar="S", help="longest search; what was found until then is told")
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        default=60.0,
+        metavar="S",
+        help="longest search of a state space, 0 for no limit; what was found by then is told (default: %(default)g)",
+    )
     parser.add_argument("--memory", type=int, default=2048, metavar="MIB", help="most memory (default: %(default)s)")
     parser.add_argument(
         *("--what-if", "-w"),
@@ -57,7 +63,8 @@ def run(options: argparse.Namespace) -> int:
     from coordinator.analysis.space import Limits
     from coordinator.taskfile import load
 
-    limits = Limits(states=options.states, seconds=options.seconds, memory=options.memory << 20, clock=time.monotonic)
+    longest = options.seconds or None
+    limits = Limits(states=options.states, seconds=longest, memory=options.memory << 20, clock=time.monotonic)
     path = task_path(options.file)
     with progress_of_search(limits) as watched:
         outcome = analyse_command(

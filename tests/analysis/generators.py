@@ -97,3 +97,48 @@ def fms(n: int) -> Net:
     arcs["endP3"] = ({"P3M2": 1}, {"P3s": 1})
     arcs["shipP3"] = ({"P3s": 1}, {"P3": 1})
     return Net.build(places, arcs)
+
+
+def shared_memory(n: int) -> Net:
+    """n processors, each with a memory that the others reach over one bus: n (n + 3) + 1 places, n (2 n + 1) transitions.
+
+    Of the Model Checking Contest: 3^n + n (n - 1) 3^(n - 1) markings, 1,863 for n = 5 and 1,830,519 for n = 10.
+    """
+    places: Weights = {"bus": 1}
+    arcs: dict[str, tuple[Weights, Weights]] = {}
+    for i in range(n):
+        places |= {f"active{i}": 1, f"memory{i}": 1, f"own{i}": 0, f"queue{i}": 0}
+        arcs[f"begin_own{i}"] = ({f"active{i}": 1}, {f"own{i}": 1})
+        arcs[f"end_own{i}"] = ({f"own{i}": 1}, {f"active{i}": 1})
+        arcs[f"request{i}"] = ({f"active{i}": 1}, {f"queue{i}": 1})
+        for j in range(n):
+            if i != j:
+                access, held = f"access{i}_{j}", {f"memory{j}": 1, "bus": 1}
+                places[access] = 0
+                arcs[f"begin{i}_{j}"] = ({f"queue{i}": 1, **held}, {access: 1})
+                arcs[f"end{i}_{j}"] = ({access: 1}, {f"active{i}": 1, **held})
+    return Net.build(places, arcs)
+
+
+def robot_cell(stations: int, parts: int, robots: int = 2) -> Net:
+    """A production cell: robots carry parts from a stock through machines that fail and are mended, and back on pallets.
+
+    6 stations + 4 places, 8 stations + 1 transitions. A robot that waits with a part before a machine that has broken down
+    puts it back (the error branch); who mends also needs a robot to hold the part.
+    """
+    places: Weights = {"stock": parts, "robots": robots, "fitter": 1, "finished": 0}
+    arcs: dict[str, tuple[Weights, Weights]] = {"restock": ({"finished": 1}, {"stock": 1})}
+    for i in range(stations):
+        idle, fetched, working, done, broken, carried = (
+            f"{s}{i}" for s in ("idle", "fetched", "working", "done", "broken", "carried")
+        )
+        places |= {idle: 1} | dict.fromkeys((fetched, working, done, broken, carried), 0)
+        arcs[f"fetch{i}"] = ({"stock": 1, "robots": 1}, {fetched: 1})
+        arcs[f"load{i}"] = ({fetched: 1, idle: 1}, {working: 1, "robots": 1})
+        arcs[f"put_back{i}"] = ({fetched: 1, broken: 1}, {broken: 1, "stock": 1, "robots": 1})
+        arcs[f"finish{i}"] = ({working: 1}, {done: 1})
+        arcs[f"fail{i}"] = ({working: 1}, {broken: 1, "stock": 1})
+        arcs[f"mend{i}"] = ({broken: 1, "fitter": 1, "robots": 1}, {idle: 1, "fitter": 1, "robots": 1})
+        arcs[f"unload{i}"] = ({done: 1, "robots": 1}, {carried: 1, idle: 1})
+        arcs[f"deliver{i}"] = ({carried: 1}, {"finished": 1, "robots": 1})
+    return Net.build(places, arcs)

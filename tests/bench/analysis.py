@@ -2,6 +2,7 @@
 
     python -m tests.bench.analysis            # all of it; tools that are not installed are named and skipped
     python -m tests.bench.analysis --quick    # small nets only
+    python -m tests.bench.analysis --write docs/figures-analysis.md    # the table as a page, too
 
 Every measurement runs in a process of its own, so that its peak memory is its own; seconds are CPU seconds without imports and
 compilation. Only figures of one run are comparable: the ratios say how many times longer the other tool takes.
@@ -17,6 +18,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -26,15 +28,21 @@ if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
 from coordinator.net import Net  # noqa: E402 - the repository's root comes first
-from tests.analysis.generators import KANBAN_RATES, fms, kanban, philosophers  # noqa: E402
+from tests.analysis.generators import KANBAN_RATES, fms, kanban, philosophers, robot_cell, shared_memory  # noqa: E402
 
 SPACES: dict[str, Callable[[], Net]] = {
     "kanban-2": lambda: kanban(2),
     "philosophers-10": lambda: philosophers(10),
     "kanban-4": lambda: kanban(4),
+    "robot-cell-8": lambda: robot_cell(8, 3),
+    "shared-memory-10": lambda: shared_memory(10),
     "fms-5": lambda: fms(5),
     "kanban-5": lambda: kanban(5),
+    "robot-cell-8 of 5": lambda: robot_cell(8, 5),
 }
+"""Philosophers-10 and robot-cell-8 have some 50 places; the last has more than 5e6 markings."""
+OTHERS_SKIP = ("robot-cell-8 of 5",)
+"""Nets on which only our engines run: there the memory is what counts."""
 QUICK = ("kanban-2", "philosophers-10")
 SLOW_STATES = 3_000
 """Markings after which the pure Python tools are stopped; their rate is what counts."""
@@ -291,11 +299,21 @@ def measured(measure: str, name: str, engine: str = "") -> dict[str, Any] | None
     return said
 
 
+TOLD: list[str] = []
+"""What was printed, for --write."""
+
+
+def tell(text: str) -> None:
+    """Print a line and keep it."""
+    print(text, flush=True)
+    TOLD.append(text)
+
+
 def line(what: str, said: dict[str, Any], unit: str, reference: float | None) -> None:
     """One line of the table; the ratio is against the reference rate."""
     rate = said[unit] / said["seconds"]
     ratio = f"{reference / rate:8.1f} x" if reference else " " * 10
-    print(
+    tell(
         f"  {what:22}{said[unit]:>11,} {unit:8}{said['seconds']:9.3f} s{rate:14,.0f} /s{ratio}{said['megabytes']:8.0f} MB"
     )
 
@@ -303,14 +321,16 @@ def line(what: str, said: dict[str, Any], unit: str, reference: float | None) ->
 def bench_spaces(names: tuple[str, ...]) -> None:
     """State spaces of all tools on all nets."""
     for name in names:
-        print(f"state space of {name} (ratio: how many times slower than numpy)")
+        net = SPACES[name]()
+        size = f"{len(net.places)} places, {len(net.transitions)} transitions"
+        tell(f"state space of {name}: {size} (ratio: how many times slower than numpy)")
         reference = None
         for what, measure, engine in (
             ("numpy", "space", "numpy"), ("auto", "space", "auto"), ("integers", "space", "integers"),
             ("numba", "space", "numba"), ("Storm", "space-storm", ""), ("SNAKES", "space-snakes", ""),
             ("pm4py", "space-pm4py", ""),
         ):  # fmt: skip
-            if engine == "integers" and name not in QUICK:
+            if (engine == "integers" and name not in QUICK) or (not engine and name in OTHERS_SKIP):
                 continue
             said = measured(measure, name, engine)
             if said:
@@ -320,7 +340,7 @@ def bench_spaces(names: tuple[str, ...]) -> None:
 
 def bench_stochastic(quick: bool) -> None:
     """Firings, long runs and completion."""
-    print("stochastic simulation of kanban-2")
+    tell("stochastic simulation of kanban-2 (ratio: how many times slower than numpy)")
     reference = None
     for what, measure, engine in (
         ("numpy", "firings", "numpy"),
@@ -332,7 +352,7 @@ def bench_stochastic(quick: bool) -> None:
             reference = reference or said["firings"] / said["seconds"]
             line(what, said, "firings", reference)
     for name in ("kanban-2",) if quick else ("kanban-2", "kanban-4"):
-        print(f"long run of {name}, build and solve")
+        tell(f"long run of {name}, build and solve")
         ours, storm = measured("long-run", name, "auto"), measured("long-run-storm", name)
         for what, said in (("numpy and scipy", ours), ("Storm", storm)):
             if said:
@@ -340,7 +360,7 @@ def bench_stochastic(quick: bool) -> None:
     for name in ("stages-4",) if quick else ("stages-4", "stages-8", "stages-16"):
         said = measured("completion", name, "auto")
         if said:
-            print(f"completion of the catching task, {name}: {said['states']:,} markings, build {said['build_seconds']:.3f} s, "
+            tell(f"completion of the catching task, {name}: {said['states']:,} markings, build {said['build_seconds']:.3f} s, "
                   f"mean and probability {said['seconds']:.4f} s, {said['megabytes']:.0f} MB")  # fmt: skip
 
 
@@ -348,6 +368,7 @@ def main() -> None:
     """The whole table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="small nets only")
+    parser.add_argument("--write", type=Path, metavar="FILE", help="write what is printed as a page, too")
     parser.add_argument("--one", nargs=3, metavar=("MEASURE", "NAME", "ENGINE"), help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one:
@@ -355,6 +376,23 @@ def main() -> None:
         return
     bench_spaces(QUICK if options.quick else tuple(SPACES))
     bench_stochastic(options.quick)
+    if options.write:
+        options.write.write_text(page(), encoding="utf-8")
+
+
+def page() -> str:
+    """The figures as a page of docs/."""
+    versions = ", ".join(f"{name} {version(name)}" for name in ("numpy", *NEEDS.values()) if find_spec(name))
+    machine = f"{os.cpu_count()} cores, Python {sys.version.split()[0]}, {versions}"
+    told = "\n".join(TOLD)
+    return (
+        "# Figures: the analysis beside other tools\n\n"
+        "Made by `python -m tests.bench.analysis --write docs/figures-analysis.md`, all tools in one run, each measurement in a\n"
+        "process of its own: CPU seconds without imports and compilation, and the peak memory of that process. Ratios hold\n"
+        f"elsewhere, seconds do not ({machine}). SNAKES and pm4py are stopped after {SLOW_STATES:,} markings: their\n"
+        "rate counts.\n\n"
+        f"```\n{told}\n```\n"
+    )
 
 
 if __name__ == "__main__":

@@ -1,0 +1,113 @@
+"""Real processes on nets without end in sight: bounded time and memory, Ctrl-C at any moment, and answers marked as partial."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from coordinator.analysis.netfile import NetFile
+from coordinator.analysis.pnml_writing import write_pnml
+from coordinator.net import Net
+from tests.analysis.generators import kanban, philosophers
+
+ROOM = 3 << 30
+"""Bytes of address space that a command gets; libraries alone map about one gigabyte."""
+
+
+def ring(places: int, tokens: int) -> Net:
+    """Tokens that go round: far more than 1e9 markings."""
+    names = [f"p{i}" for i in range(places)]
+    arcs = {f"t{i}": ({names[i]: 1}, {names[(i + 1) % places]: 1}) for i in range(places)}
+    return Net.build({**dict.fromkeys(names, 0), names[0]: tokens}, arcs)
+
+
+def started(net: Net, folder: Path, *arguments: str) -> subprocess.Popen[str]:
+    """A command on the net, with its memory limited by the system."""
+    path = folder / "net.pnml"
+    path.write_text(write_pnml(NetFile(net)), encoding="utf-8")
+    command, *rest = arguments
+    return subprocess.Popen(
+        [sys.executable, "-m", "coordinator", command, str(path), *rest],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (ROOM, ROOM)),
+    )
+
+
+def answered(process: subprocess.Popen[str], *, proven: bool = False) -> dict[str, Any]:
+    """Its JSON; 1 is the code where something is not known."""
+    out, complaint = process.communicate(timeout=300)
+    assert process.returncode == (0 if proven else 1), complaint
+    data: dict[str, Any] = json.loads(out)
+    return data
+
+
+@pytest.mark.parametrize(
+    ("net", "deadlock"),
+    [(philosophers(60), True), (kanban(50), False), (ring(300, 20), False)],
+    ids=["300 places", "1e16", "ring"],
+)
+def test_what_has_no_end_in_sight_ends_with_an_honest_part(net: Net, deadlock: bool, tmp_path: Path) -> None:
+    """Stubborn sets find the one deadlock; siphons with marked traps rule out any in the other two."""
+    process = started(net, tmp_path, "analyse", "--rates", "unit", "--states", "20000", "--json", "-")
+    data = answered(process, proven=not deadlock)
+    assert data["complete"] is False and "limit of 20000 states" in data["reason"] and data["bounded"] is True
+    assert data["states"] >= 20_000 and data["home_states"] is None
+    assert data["throughput"] is None and data["mean_tokens"] is None and data["residual"] is None
+    assert any("simulate instead" in note for note in data["notes"])
+    assert data["deadlock"] is deadlock and data["live"] is (False if deadlock else None)
+
+
+def test_what_cannot_be_solved_can_be_played(tmp_path: Path) -> None:
+    arguments = ("simulate", "--rates", "unit", "--replicas", "20", "--horizon", "2", "--json", "-")
+    process = started(ring(300, 20), tmp_path, *arguments)
+    out, complaint = process.communicate(timeout=300)
+    assert process.returncode == 0, complaint
+    data = json.loads(out)
+    assert (
+        data["complete"]
+        and data["firings"] > 20
+        and sum(x[0] for x in data["mean_tokens"].values()) == pytest.approx(20)
+    )
+
+
+@pytest.mark.parametrize("net", [philosophers(60), kanban(5)], ids=["300 places", "2.5 million markings"])
+@pytest.mark.parametrize("share", [0.2, 1.0])
+def test_ctrl_c_leaves_what_was_known(net: Net, share: float, tmp_path: Path) -> None:
+    """At two moments after the search has begun, told by the processor time that it has taken."""
+    process = started(net, tmp_path, "analyse", "--rates", "unit", "--json", "-")
+    _interrupt_after(process, 0.8 + share)
+    data = answered(process)
+    assert data["complete"] is False and data["reason"] == "interrupted" and any("Ctrl-C" in n for n in data["notes"])
+    assert data["states"] >= 1 and data["live"] is not True and data["throughput"] is None
+
+
+def test_ctrl_c_ends_a_simulation_with_its_intervals(tmp_path: Path) -> None:
+    arguments = ("simulate", "--rates", "unit", "--horizon", "1e6", "--replicas", "100", "--json", "-")
+    process = started(kanban(5), tmp_path, *arguments)
+    _interrupt_after(process, 1.2)
+    data = answered(process)
+    assert data["complete"] is False and data["firings"] > 0 and data["throughput"]["tin1"][0] > 0
+
+
+def _interrupt_after(process: subprocess.Popen[str], seconds: float) -> None:
+    """Ctrl-C once the process has taken that much processor time."""
+    ticks, statistics = os.sysconf("SC_CLK_TCK"), Path(f"/proc/{process.pid}/stat")
+    while process.poll() is None:
+        fields = statistics.read_text().rpartition(")")[2].split()
+        if (int(fields[11]) + int(fields[12])) / ticks >= seconds:
+            process.send_signal(signal.SIGINT)
+            return
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(timeout=0.05)
