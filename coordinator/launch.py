@@ -17,7 +17,6 @@ from coordinator.journal import Journal, JournalWriter
 from coordinator.lockstep_party import NAME, CoordinatorParty
 from coordinator.mission import Mission
 from coordinator.partners import FirstAlternative, Forgetful, Observer, Selector, Store
-from coordinator.realtime import credentials_of
 from coordinator.recording import EPOCH, JournalStore, last_epoch, origin_of, replay, stages
 from coordinator.supervisor import Program, is_local
 from coordinator.task import Task
@@ -25,6 +24,7 @@ from services.comm.caller import Caller
 from services.comm.cell import Cell, Delays
 from services.comm.directory import Directory, NodeEntry
 from services.comm.lockstep import Member
+from services.comm.lockstep_process import cell_key
 from services.comm.messages import Hello
 from services.comm.party import Party
 from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
@@ -134,7 +134,7 @@ def lockstep_member(
     """
     watching = None if watch is None else lambda now: watch(mission, now)
     coordinator = CoordinatorParty(directory, mission, watching, begin)
-    delays, key = Delays(directory.delays()), credentials_of(directory).key
+    delays, key = Delays(directory.delays()), cell_key(directory)
     addresses, rejoins = directory.members(), begin is not None
     member = Member(NAME, [coordinator], addresses, delays=delays, directory=directory.hash, key=key, rejoins=rejoins)
     return member, coordinator

@@ -133,8 +133,8 @@ def _run(run: Callable[[argparse.Namespace], int], options: argparse.Namespace) 
     try:
         return int(run(options))
     except Exception as fault:
-        from services.comm.security import KeyFileError
+        from services.comm.security import KeyFileError, KeyNeededError
 
-        if isinstance(fault, KeyFileError):
+        if isinstance(fault, KeyFileError | KeyNeededError):
             raise CommandError(2, str(fault)) from fault
         raise

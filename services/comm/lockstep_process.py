@@ -10,7 +10,25 @@ from typing import Protocol
 from services.comm.directory import COORDINATOR, Directory
 from services.comm.lockstep import Delays, Member
 from services.comm.party import Party
-from services.comm.security import read_key
+from services.comm.security import KeyNeededError, is_loopback, read_key
+
+
+def cell_key(directory: Directory) -> bytes | None:
+    """What seals the ticks of a lock-step cell: the shared key, if there is one.
+
+    Ticks cross no TLS (docs/decisions/lock-step-doors.md): with certificates all members must be on loopback. Raises
+    KeyNeededError where they are not, KeyFileError for a key file that cannot be used.
+    """
+    if "file" in directory.keys:
+        return read_key(directory.file(directory.keys["file"]))
+    if "certificates" in directory.keys:
+        for name, (host, _) in directory.members().items():
+            if not is_loopback(host):
+                raise KeyNeededError(
+                    f"{directory.source}: lock step crosses no TLS, and {name} is at {host}: for lock step over several hosts "
+                    'write file = "cell.key" in place of certificates under [keys] (`petrobot keys` makes it), or use one host'
+                )
+    return None
 
 
 class Closable(Party, Protocol):
@@ -26,7 +44,7 @@ def run_member(directory: Directory, name: str, party: Closable, awaited: float)
     `awaited`: seconds (wall time) that a coordinator which died may take to come back; 0: it is not waited for.
     Raises CellError when another member is lost, KeyFileError for a key file that cannot be used.
     """
-    key = read_key(directory.file(directory.keys["file"])) if "file" in directory.keys else None
+    key = cell_key(directory)
     member = Member(
         name,
         [party],
