@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from services.vision.optics import Optics
 
@@ -134,6 +133,9 @@ class _Adjustment:
 
     def solve(self) -> Calibration:
         """Start from calibrateCamera, refine all together, report residuals."""
+        # not above: a node that only reads a calibration would load all of it for nothing, a third of its start
+        from scipy.optimize import least_squares
+
         start = self._start()
         fit = least_squares(self._residuals, start, self._slopes, method="lm", x_scale="jac", xtol=1e-10)
         if not fit.success:
