@@ -31,8 +31,7 @@ export class Desk {
     const running = this.designer.link.state.task?.name;
     const known = tasks.map((t) => t.name);
     for (const name of known.includes(running) ? [running, ...known] : known) {
-      await this.open(name); // one that cannot be read does not keep the others closed
-      if (this.model.name) return;
+      if (await this.open(name)) return; // one that cannot be read does not keep the others closed
     }
     this.designer.view.fit();
   }
@@ -43,16 +42,23 @@ export class Desk {
     return tasks;
   }
 
-  /** Open a task; of several documents asked for, the last one is shown whichever answer comes last. */
+  /**
+   * Open a task; of several documents asked for, the last one is shown whichever answer comes last. False when it cannot be
+   * read: what was open stays, and so does its name.
+   */
   async open(name) {
     const asked = ++this.documents;
     const task = await openTask(name);
-    if (asked !== this.documents) return;
-    if (!task) return void this.designer.bar.paint(); // what was open stays, and so does its name
+    if (asked !== this.documents) return true;
+    if (!task) {
+      this.designer.bar.paint();
+      return false;
+    }
     this.put(task, task.own === false);
     this.designer.findings.take(task);
     await this.refresh();
     this.designer.view.fit();
+    return true;
   }
 
   async pick(wanted) {
