@@ -10,6 +10,7 @@ import pytest
 
 from coordinator.dispatch import ESCALATION
 from coordinator.engine import Abort, Begin, CancelRun, RunRecorded
+from coordinator.fences import STOP_MARGIN
 from coordinator.task import Executed, Status
 from services.comm import messages as m
 from tests.coordinator.toy_arm import TIDY, WORK, Bench
@@ -112,6 +113,21 @@ def test_plansys2_400_a_silent_performer_is_never_replaced_by_a_second_one() -> 
         ids += bench.calls()
     assert WORK not in ids and ids == [], "no call is made again, and nothing else is given the arm"
     assert bench.records[0].executed is Executed.UNKNOWN
+
+
+def test_plansys2_400_one_that_did_not_even_accept_is_not_asked_a_second_time() -> None:
+    """It may be at work all the same: its call is not made again, and the arm is nobody's until its node must have stopped it."""
+    bench = Bench()
+    bench.link(0.0)
+    bench.executor.stimulate(0.0, Begin())
+    assert bench.calls() == [WORK]
+    ids: list[str] = []
+    for tenth in range(1, 40):
+        bench.go(tenth / 10)
+        ids += bench.calls()
+    assert ids == [] and bench.records[0].cause == "not_accepted"
+    bench.go(1.0 + 1.0 + STOP_MARGIN)
+    assert bench.calls() == [TIDY]
 
 
 def test_plansys2_400_nobody_gets_the_arm_before_the_first_performer_has_let_go() -> None:

@@ -65,3 +65,22 @@ async def test_the_second_coordinator_is_refused_until_the_first_has_gone(tmp_pa
     begun = moves(tmp_path, "begin")
     assert set(begun.values()) == {1} and not moves(tmp_path, "overlap")
     assert not any(call.startswith(second.executor.mission) for call in begun)
+
+
+async def test_a_good_bye_whose_link_is_broken_is_said_over_another(tmp_path: Path) -> None:
+    """The cable is cut as the first one is done: it comes back to say so, and whoever comes next has the hands at once."""
+    directory = load(shuttle_services(tmp_path))
+    first, second = mission_on(directory, 2), mission_on(directory, 2)
+    async with Supervisor(local_programs(directory), tmp_path / "logs"):
+        shell = RealtimeMission(first, directory)
+        await shell.connect(30.0)
+        await asyncio.wait_for(shell.run(), LIMIT)
+        for client in shell.clients.values():
+            assert client._link is not None
+            client._link.cut("somebody stumbled over it")
+        async with asyncio.timeout(LIMIT):
+            while any(client.caller.up for client in shell.clients.values()):
+                await beat(0.001)
+        await shell.close()
+        await led(directory, second)
+    assert second.tally.runs and all(r.status is Status.SUCCESS for r in second.tally.runs), second.tally.runs

@@ -1,0 +1,56 @@
+"""A disk that is full in the middle of a run: one clear error, nothing done that is not kept, and a resume that ends the run."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from coordinator.journal import read_journal
+from coordinator.runfolder import JOURNAL
+from tests.chaos.shuttle_cell import ROOT, TASK, moves, shuttle_services
+from tests.integration.test_resume_processes import PATIENCE, QUIET, nodes, petrobot
+
+pytestmark = pytest.mark.processes
+RUNS = 8
+ROOM = 6
+"""Kilobytes that any file of the coordinator may have: its journal's header takes four of them (ulimit -f, setrlimit(2))."""
+
+
+def test_a_full_disk_ends_the_run_in_clear_and_loses_nothing(tmp_path: Path) -> None:
+    shuttle_services(tmp_path, fetch=0.2, carry=0.2, orphan=60.0)
+    runs = tmp_path / "runs"
+    given = [
+        "run",
+        str(TASK),
+        "--runs",
+        str(RUNS),
+        "--services",
+        str(tmp_path / "services.toml"),
+        "--journal",
+        str(runs),
+    ]
+    command = shlex.join([sys.executable, "-m", "coordinator", *given, *QUIET])
+    up = nodes(tmp_path)
+    try:
+        full = ["bash", "-c", f"ulimit -f {ROOM}; exec {command}"]
+        done = subprocess.run(full, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=False)
+        assert done.returncode == 1, done.stdout + done.stderr
+        assert f"{JOURNAL}: File too large; nothing was sent on the strength of it" in done.stderr
+        assert "Traceback" not in done.stderr
+        [run] = runs.iterdir()
+        kept = [r.data["stimulus"] for r in read_journal(run / JOURNAL).records if r.kind == "stimulus"]
+        assert kept, "it was full in the middle of the run"
+        resumed = petrobot(tmp_path, "resume", str(run), "--json", str(tmp_path / "out.json"), *QUIET)
+        assert resumed.wait(PATIENCE) == 0, (tmp_path / "resume.txt").read_text()
+    finally:
+        up.terminate()
+        up.wait(PATIENCE)
+    assert json.loads((tmp_path / "out.json").read_text())["status"] == "success"
+    begun = moves(tmp_path, "begin")
+    assert set(begun.values()) == {1} and not moves(tmp_path, "overlap")
+    assert len([call for call in begun if "tidy" not in call]) == RUNS, "every run was made, each once"
