@@ -214,7 +214,12 @@ async def test_a_run_sets_out_from_a_point_of_another(
     assert (source["run"], source["going"]) == (first, {"look": "error"})
     await tab.get_by_role("tab", name="History").click()
     await tab.get_by_role("navigation", name="Runs").get_by_role("button", name=re.compile(f"^{made}")).click()
-    await expect(tab.get_by_role("complementary", name="Records")).to_contain_text(f"from {first}")
+    about = tab.get_by_role("complementary", name="Records").get_by_role("status")
+    await expect(about).to_contain_text(f"from {first}")
+    await tab.get_by_role("button", name=f"Compare with {first}").click()
+    await expect(about).to_contain_text("compared from there. The runs differ from firing 1: unseen here, seen there")
+    await tab.get_by_role("button", name="Go there").click()
+    await tab.screenshot(path=shots / "compare-from.png")
     assert complaints == []
 
 

@@ -39,7 +39,13 @@ class Reel {
 
   /** The index at which so many firings have happened. */
   atFirings(count) {
-    return count ? (this.firings[count - 1]?.index ?? this.records.length) : 0;
+    return count > 0 ? (this.firings[count - 1]?.index ?? this.records.length) : this.run.from?.record ? 1 : 0;
+  }
+
+  /** How many firings of this run another one has behind it that set out from it; null if it did not. */
+  before(made) {
+    const { from } = made.run;
+    return from?.run === this.run.id ? this.firings.filter((f) => this.records[f.index - 1].number <= from.record).length : null;
   }
 
   firingsUpTo(index) {
@@ -52,7 +58,7 @@ class Screen {
     this.canvas = new Canvas(label, { opened: (e) => e.kind === "macro" && this.open(e.name) });
     this.inside = "";
     this.tag = h("span", { class: "tag" });
-    this.canvas.root.append(this.tag);
+    this.canvas.bar.append(this.tag);
   }
 
   load(reel) {
@@ -218,10 +224,15 @@ export class History {
     this.go(this.index, false);
   }
 
-  /** The first firing in which two runs differ, counted from 1; 0 when one is the beginning of the other. */
+  /** Firings of the shown run before the other one sets out from it; negative: the other way round; 0: both begin alike. */
+  get shift() {
+    return this.reel.before(this.other) ?? -(this.other.before(this.reel) ?? 0);
+  }
+
+  /** The first firing in which two runs differ, counted from 1 in the shown one; 0 when they do not. */
   firstDifference() {
-    const [a, b] = [this.reel.firings, this.other.firings];
-    for (let i = 0; i < Math.max(a.length, b.length); i++) if (a[i]?.transition !== b[i]?.transition) return i + 1;
+    const [a, b, shift] = [this.reel.firings, this.other.firings, this.shift];
+    for (let i = Math.max(0, shift); i < Math.max(a.length, b.length + shift); i++) if (a[i]?.transition !== b[i - shift]?.transition) return i + 1;
     return 0;
   }
 
@@ -230,10 +241,11 @@ export class History {
     const from = run.from ? `from ${run.from.run}, ${run.from.record ? `record ${run.from.record}` : "beginning"}` : "";
     const facts = [`${run.records.length} records`, `${this.reel.firings.length} firings`, run.seed !== undefined && run.seed !== null ? `seed ${run.seed}` : "", run.mode, from].filter(Boolean).join(", ");
     if (!this.other) return fill(this.about, run.fault ? h("span", {}, icon("warning"), ` ${run.fault}. `) : null, facts);
-    const first = this.firstDifference();
-    if (!first) return fill(this.about, "Both runs fired the same transitions in the same order.");
-    const name = (reel) => (reel.firings[first - 1] ? this.labelOf(reel.firings[first - 1].transition) : "nothing more");
-    return fill(this.about, `The runs differ from firing ${first}: ${name(this.reel)} here, ${name(this.other)} there. `, h("button", { type: "button", class: "small", onclick: () => this.go(this.reel.atFirings(first)) }, "Go there"));
+    const [first, shift] = [this.firstDifference(), this.shift];
+    const since = shift ? `One set out from the other and is compared from there. ` : "";
+    if (!first) return fill(this.about, `${since}Both runs fired the same transitions in the same order.`);
+    const name = (firing) => (firing ? this.labelOf(firing.transition) : "nothing more");
+    return fill(this.about, `${since}The runs differ from firing ${first}: ${name(this.reel.firings[first - 1])} here, ${name(this.other.firings[first - 1 - shift])} there. `, h("button", { type: "button", class: "small", onclick: () => this.go(this.reel.atFirings(first)) }, "Go there"));
   }
 
   // ---- scrubbing ----------------------------------------------------------------------------------------------------
@@ -246,7 +258,7 @@ export class History {
     this.index = next;
     this.range.value = String(next);
     this.screens[0].show(next, flies);
-    if (this.other) this.screens[1].show(this.other.atFirings(this.reel.firingsUpTo(next)), flies);
+    if (this.other) this.screens[1].show(this.other.atFirings(this.reel.firingsUpTo(next) - this.shift), flies);
     const record = records[next - 1];
     text(this.where, next ? `${next} of ${records.length}, ${seconds(record.t)}` : `beginning of ${records.length}`);
     attribute(this.range, "aria-valuetext", next ? `record ${next}: ${record.text}` : "beginning");
