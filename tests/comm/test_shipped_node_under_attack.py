@@ -11,6 +11,7 @@ import random
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,8 @@ pytestmark = pytest.mark.processes
 GROWTH = 24 << 20
 """Bytes by which the node may be larger after an attack than before."""
 MIB = 1 << 20
+BEAT = 0.1
+"""Seconds after which the good caller speaks again: silent for 1 s it would be cut, too."""
 
 
 @dataclass
@@ -109,11 +112,11 @@ def malformed(random_: random.Random) -> bytes:
 
 
 def attack(vision: Vision, connections: int) -> None:
-    """So many connections that are no good; the good caller asks after every hundred of them."""
+    """So many connections that are no good; the good caller asks ten times a second and is answered each time."""
     random_ = random.Random(connections)
     good = vision.good("good")
     ask(good, 0)
-    before, open_before = vision.size(), vision.sockets()
+    before, open_before, asked = vision.size(), vision.sockets(), time.monotonic()
     for number in range(1, connections + 1):
         stranger = vision.stranger()
         with contextlib.suppress(ConnectionError):
@@ -123,8 +126,9 @@ def attack(vision: Vision, connections: int) -> None:
                 while stranger.recv(4096):
                     pass
         stranger.close()
-        if number % 100 == 0:
+        if time.monotonic() > asked + BEAT:
             ask(good, number)
+            asked = time.monotonic()
     good.say(f.BYE)
     good.close()
     ask(after := vision.good("after"), 0)
