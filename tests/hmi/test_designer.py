@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import re
+from collections import Counter
 from collections.abc import AsyncIterator
 from pathlib import Path
 
@@ -372,6 +373,35 @@ async def test_the_page_lays_out_as_the_drawing_does(browser: Browser, page: Pag
         there = await tab.evaluate(script, [names, edges, sources])
         assert there.keys() == here.keys()
         assert [there[n] for n in names] == [pytest.approx(here[n]) for n in names]
+
+
+COVERED = (Path(__file__).parent / "covered_words.js").read_text(encoding="utf-8")
+
+
+async def test_words_on_the_page_cover_nothing(browser: Browser, page: Page, tasks: Path) -> None:
+    """Random nets laid out by the page: measured in the browser no words cover words or elements, and few arcs strike words."""
+    tab, _ = await designing(browser, page)
+    total: Counter[str] = Counter()
+    for seed in range(40, 45):
+        net = random_task(np.random.default_rng(seed), 3)
+        arcs = [
+            f"in = {[net.places[p] for p, _ in net.consume[t]]}\nout = {[net.places[p] for p, _ in net.produce[t]]}\n"
+            for t in range(len(net.transitions))
+        ]
+        text = 'schema = 1\n[task]\nname = "random"\nfinal = "false"\n'
+        text += "".join(
+            f'[places.{p}]\nkind = "control"\ntokens = {n}\n' for p, n in zip(net.places, net.initial, strict=True)
+        )
+        text += "".join(f"[transitions.{t}]\n{a}" for t, a in zip(net.transitions, arcs, strict=True))
+        (tasks / f"random_{seed}.toml").write_text(text)
+        await tab.reload()
+        await expect(tab.locator(".saved")).to_have_text("saved")
+        await open_task(tab, f"random_{seed}")
+        await expect(element(tab, "^Transition ")).to_have_count(len(net.transitions))
+        total.update(await tab.evaluate(COVERED))
+    assert total["words"] > 80
+    assert total["words_on_words"] == total["words_on_elements"] == total["elements_on_elements"] == 0, total
+    assert total["struck"] <= 0.1 * total["words"], total
 
 
 # ---- while something else goes on -------------------------------------------------------------------------------------
