@@ -25,7 +25,10 @@ ALLOWED: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("coordinator.taskfile", ("coordinator.net", "coordinator.task", "coordinator.conditions")),
     ("coordinator.check", ("coordinator.net", "coordinator.task", "coordinator.conditions")),
     ("coordinator.drawing", ("coordinator.net", "coordinator.task", "coordinator.conditions")),
-    ("coordinator.analysis", ("coordinator.net", "coordinator.task", "coordinator.conditions")),
+    (
+        "coordinator.analysis",
+        ("coordinator.net", "coordinator.task", "coordinator.conditions", "services.comm.compiled"),
+    ),
     ("coordinator.learning", ("coordinator.net", "coordinator.task")),
     ("coordinator.engine", ("coordinator.net", "coordinator.task", "coordinator.conditions")),
     ("coordinator.hmi", ("coordinator", "services.comm")),

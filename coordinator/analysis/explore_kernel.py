@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.analysis.compiled import jit
 from coordinator.analysis.pack import Rules, Words
+from services.comm.compiled import kernel
 
 DONE, FULL, CROWDED, OVERFLOWN, CAPPED = 0, 1, 2, 3, 4
 """Why the loop came back: block expanded, edge buffer full, keys or table crowded, a field overflowed, cap reached."""
@@ -45,7 +45,7 @@ class Kernel(NamedTuple):
         )
 
 
-@jit
+@kernel
 def enabled_into(
     key: Words,
     able: NDArray[np.int64],
@@ -77,7 +77,7 @@ def enabled_into(
     return count
 
 
-@jit
+@kernel
 def enter_all(keys: Words, states: int, table: NDArray[np.int32], factors: Words) -> None:
     """Enter the first `states` keys, all different, in an empty table."""
     mask, words = np.uint64(len(table) - 1), keys.shape[1]
@@ -92,7 +92,7 @@ def enter_all(keys: Words, states: int, table: NDArray[np.int32], factors: Words
         table[slot] = number
 
 
-@jit
+@kernel
 def expand_block(
     keys: Words,
     table: NDArray[np.int32],

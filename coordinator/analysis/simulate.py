@@ -181,11 +181,11 @@ def _compiled(
     progress: Callable[[int, float], None] | None,
 ) -> Simulation:
     """Replicas one after the other by the compiled kernel."""
-    from coordinator.analysis.compiled import COMPILED
     from coordinator.analysis.simulate_kernel import Tables, play
+    from services.comm.compiled import plain
 
-    if not COMPILED:
-        raise ImportError("the engine 'numba' needs numba: install petrobot[numba], or take the engine 'numpy'")
+    if plain(play) is play:
+        raise ImportError("the engine 'numba' needs numba: install petrobot[fast], or take the engine 'numpy'")
     if goal is not None or not horizon < np.inf:
         raise ValueError("the engine 'numba' plays to a horizon; take the engine 'numpy' for a goal")
     tables, initial = Tables.of(gspn), np.array(gspn.net.initial, dtype=np.int64)

@@ -1,6 +1,6 @@
 """The loop of the compiled simulation: one replica after the other, only the transitions that a firing touches are looked at.
 
-Plain enough for numba, and the same, only slow, without it (coordinator/analysis/compiled.py).
+Plain enough for numba, and the same, only slow, without it (services/comm/compiled.py).
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.analysis.compiled import jit
 from coordinator.analysis.gspn import Gspn
 from coordinator.analysis.pack import dependents, effect, thresholds
+from services.comm.compiled import kernel
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -69,7 +69,7 @@ def _ragged(rows: list[list[tuple[int, int]]]) -> tuple[Ints, Ints, Ints]:
     return first, np.array([a for a, _ in flat], dtype=np.int64), np.array([b for _, b in flat], dtype=np.int64)
 
 
-@jit
+@kernel
 def settle(area: Floats, tokens: Ints, since: Floats, now: float) -> None:
     """Add what every place has held since its tokens last changed."""
     for p in range(len(tokens)):
@@ -77,7 +77,7 @@ def settle(area: Floats, tokens: Ints, since: Floats, now: float) -> None:
             area[p] += tokens[p] * (now - since[p])
 
 
-@jit
+@kernel
 def play(
     initial: Ints,
     tables: Any,

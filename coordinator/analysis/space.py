@@ -203,11 +203,12 @@ def _engine(name: str, begun: Explored, bounds: Sequence[int | None] | None) -> 
     guess = [b if b is not None else 2 * top + 1 for b, top in zip(known, seen, strict=True)]
     begun = begun.relaid(Layout.for_net(begun.net, [max(g, top) for g, top in zip(guess, seen, strict=True)]))
     if name == "numba":
-        from coordinator.analysis.compiled import COMPILED
+        from coordinator.analysis.explore_kernel import expand_block
         from coordinator.analysis.explore_numba import NumbaEngine
+        from services.comm.compiled import plain
 
-        if not COMPILED:
-            raise ImportError("the engine 'numba' needs numba: install petrobot[numba], or take the engine 'numpy'")
+        if plain(expand_block) is expand_block:
+            raise ImportError("the engine 'numba' needs numba: install petrobot[fast], or take the engine 'numpy'")
         return NumbaEngine(begun)
     from coordinator.analysis.explore_numpy import NumpyEngine
 

@@ -8,7 +8,6 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.stats import gamma
 
-from coordinator.analysis.compiled import COMPILED
 from coordinator.analysis.completion import completion, law
 from coordinator.analysis.gspn import Chain, Gspn
 from coordinator.analysis.markov import long_run, transient
@@ -16,6 +15,7 @@ from coordinator.analysis.phase_type import fit, fit_samples, gamma_quantile
 from coordinator.analysis.simulate import Estimate, goal_by_marking, simulate, token_game
 from coordinator.analysis.simulate_kernel import Tables, play
 from coordinator.net import Net
+from services.comm.compiled import COMPILED
 from tests.analysis.generators import KANBAN_RATES, kanban, queue, stages
 from tests.analysis.random_nets import gspns
 
@@ -160,7 +160,7 @@ def test_the_compiled_loop_plays_the_same_net(gspn: Gspn, seed: int) -> None:
 def test_the_compiled_engine_is_an_extra() -> None:
     gspn = Gspn.of(queue(5), {"arrive": 0.8, "serve": 1.0})
     if not COMPILED:
-        with pytest.raises(ImportError, match=r"petrobot\[numba\]"):
+        with pytest.raises(ImportError, match=r"petrobot\[fast\]"):
             simulate(gspn, sure(10), horizon=10.0, engine="numba")
         return
     seen = simulate(gspn, sure(10), replicas=300, horizon=300.0, warmup=30.0, engine="numba", confidence=0.9999)

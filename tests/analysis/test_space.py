@@ -9,13 +9,14 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from coordinator.analysis import compiled, explore_numba
+from coordinator.analysis import explore_numba
 from coordinator.analysis.explore import Engine, Explored
 from coordinator.analysis.explore_integers import IntegerEngine
 from coordinator.analysis.explore_numpy import NumpyEngine
 from coordinator.analysis.pack import Layout, TooManyTokens
 from coordinator.analysis.space import EngineName, Limits, Space, explore
 from coordinator.net import Net
+from services.comm.compiled import COMPILED
 from tests.analysis.generators import fms, kanban, philosophers
 from tests.analysis.random_nets import brute_force, nets
 
@@ -188,10 +189,10 @@ def test_without_edges_the_counts_stay() -> None:
 
 
 def test_numba_is_asked_for_by_name_only() -> None:
-    if compiled.COMPILED:
+    if COMPILED:
         assert len(explore(kanban(2), engine="numba")) == 4600
     else:
-        with pytest.raises(ImportError, match=r"petrobot\[numba\]"):
+        with pytest.raises(ImportError, match=r"petrobot\[fast\]"):
             explore(kanban(1), engine="numba")
 
 

@@ -138,7 +138,8 @@ def storm_model(net: Net, rates: dict[str, float]) -> Any:
     """A GSPN in Storm."""
     from stormpy import gspn  # type: ignore[import-not-found]
 
-    builder = gspn.GspnBuilder()
+    builder = getattr(gspn, "GspnBuilder", None) or gspn.GSPNBuilder  # renamed in stormpy 2
+    builder = builder()
     places = [builder.add_place(CAPACITY, n, p) for p, n in zip(net.places, net.initial, strict=True)]
     for t, name in enumerate(net.transitions):
         node = builder.add_timed_transition(0, rates.get(name, 1.0), 1, name)
@@ -166,7 +167,9 @@ def storm_jani(model: Any) -> Any:
     """Storm's symbolic description of a GSPN."""
     from stormpy import gspn
 
-    return gspn.build_jani_model(model)[0]
+    if hasattr(gspn, "build_jani_model"):
+        return gspn.build_jani_model(model)[0]
+    return gspn.GSPNToJaniBuilder(model).build()
 
 
 # Stochastic.
@@ -244,7 +247,8 @@ def long_run_storm(name: str) -> dict[str, Any]:
         (formula,) = stormpy.parse_properties("LRA=? [ pkan1 > 0 ]", jani)
         model = stormpy.build_model(jani, [formula])
         found = stormpy.model_checking(model, formula)
-        return {"states": model.nr_states, "value": found.get_value(model.initial_states[0])}
+        value = getattr(found, "get_value", None) or found.at  # renamed in stormpy 2
+        return {"states": model.nr_states, "value": value(model.initial_states[0])}
 
     return timed(work)
 
