@@ -11,7 +11,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, Protocol
 
 from coordinator.controls import Answer, Controls, refusal
-from coordinator.emergency import order_all
+from coordinator.emergency import CLEAR, STOP, order_all
 from coordinator.engine import (
     Abort,
     AddTokens,
@@ -228,7 +228,7 @@ class Operation:
 
     async def _do_estop(self, who: str, data: Mapping[str, Any]) -> Answer:
         for node in self.mission.callers:
-            self.watching.ask(node, "emergency_stop")
+            self.watching.ask(node, STOP)
         answer = self._order(Abort(f"emergency stop by {who}"))
         self.feed.emit("mission", mission={"state": "stopped", "reason": f"emergency stop by {who}"})
         if self._live and (self._stopping is None or self._stopping.done()):
@@ -244,10 +244,15 @@ class Operation:
                 self.feed.emit("notice", notice={"level": "error", "text": text, "at": self.feed.state["time"]})
 
     async def _do_clear_estop(self, who: str, data: Mapping[str, Any]) -> Answer:
-        """Devices take orders again; nothing moves by that alone."""
-        for node in self.mission.callers:
-            self.watching.ask(node, "clear_emergency")
-        return {"ok": True}
+        """Devices take orders again; nothing moves by that alone. Refused with the reason when a node still has them stopped."""
+        if not self._live:
+            for node in self.mission.callers:
+                self.watching.ask(node, CLEAR)
+            return {"ok": True}
+        directory = self.executor.directory
+        told = await order_all(directory, credentials_of(directory), CLEAR)
+        still = [f"{one.node}: {one.why or 'no answer'}" for one in told if not one.answered]
+        return refusal("unreachable", "; ".join(still)) if still else {"ok": True}
 
     async def _until(self, ready: Callable[[], bool], timeout: float) -> None:
         deadline = asyncio.get_running_loop().time() + timeout

@@ -1,0 +1,101 @@
+"""The emergency stop's latch: what is kept, what counts when it cannot be read or written, and what a node makes of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from services.comm.latch import ALL, STATE, Latch, LatchError, latch_of
+from services.emergency_stops import LOOK, NEVER, EmergencyStops
+
+DEVICES = ("arm", "camera", "gripper")
+
+
+def latch(folder: Path) -> Latch:
+    """A latch with two places to lie in."""
+    return Latch("motion", [folder / "first", folder / "second"])
+
+
+def test_what_is_stopped_stays_so_until_it_is_cleared(tmp_path: Path) -> None:
+    """Another process reads the same; stops add up; clearing some leaves the others."""
+    assert latch(tmp_path).stopped() == frozenset()
+    assert latch(tmp_path).stop(["arm"]) == tmp_path / "first" / "motion.stopped"
+    latch(tmp_path).stop(["camera"])
+    assert latch(tmp_path).stopped() == {"arm", "camera"}
+    latch(tmp_path).clear(["arm"], DEVICES)
+    assert latch(tmp_path).stopped() == {"camera"}
+    latch(tmp_path).clear(DEVICES, DEVICES)
+    assert latch(tmp_path).stopped() == frozenset() and not list(tmp_path.rglob("*.stopped*"))
+
+
+def test_all_is_every_device_also_when_one_is_cleared(tmp_path: Path) -> None:
+    latch(tmp_path).stop([ALL])
+    latch(tmp_path).clear(["arm"], DEVICES)
+    assert latch(tmp_path).stopped() == {"camera", "gripper"}
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"\n\n", b"\xff\xfe\x00", None], ids=["empty", "blank", "no text", "a folder"]
+)
+def test_whoever_is_unsure_leaves_everything_stopped(tmp_path: Path, content: bytes | None) -> None:
+    """A file that a power cut or a hand has spoilt is no permission to move."""
+    path = latch(tmp_path).paths[1]
+    path.parent.mkdir()
+    if content is None:
+        path.mkdir()
+    else:
+        path.write_bytes(content)
+    assert latch(tmp_path).stopped() == {ALL}
+    stops = EmergencyStops(DEVICES, latch(tmp_path))
+    assert stops.at_start() == list(DEVICES)
+
+
+def test_where_one_place_cannot_be_written_the_other_is(tmp_path: Path) -> None:
+    (tmp_path / "first").mkdir()
+    (tmp_path / "first" / "motion.stopped").mkdir()  # nothing can be put in its place
+    assert Latch("motion", [tmp_path / "none" / ".." / "second"]).stop(["arm"])
+    assert latch(tmp_path).stop(["arm"]) == tmp_path / "second" / "motion.stopped"
+
+
+def test_a_stop_that_cannot_be_kept_is_said_and_holds_all_the_same(tmp_path: Path) -> None:
+    """Until the node's end; a clear that fails clears nothing, in memory or on disk."""
+    (tmp_path / "file").write_text("")
+    nowhere = Latch("motion", [tmp_path / "file" / "folder"])
+    with pytest.raises(LatchError, match="Not a directory"):
+        nowhere.stop(["arm"])
+    stops = EmergencyStops(DEVICES, nowhere)
+    assert "will not outlive a restart" in stops.stop(["arm"]) and "arm" in stops
+    stuck = latch(tmp_path)
+    stuck.paths[0].mkdir(parents=True)
+    stops = EmergencyStops(DEVICES, stuck)
+    stops.at_start()
+    assert "remove it by hand once the cell is safe" in stops.clear(["arm"]) and "arm" in stops
+
+
+def test_a_node_that_can_keep_no_latch_comes_up_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It cannot know whether it was stopped: no file is no proof where none can be."""
+    monkeypatch.setattr("services.comm.latch._writable", lambda folder: False)
+    stops = EmergencyStops(DEVICES, latch(tmp_path))
+    assert stops.at_start() == list(DEVICES)
+    assert stops.clear(DEVICES) == "" and stops.names == (), "an operator may say so for this life of it"
+
+
+def test_what_another_has_latched_is_heeded_at_the_next_look(tmp_path: Path) -> None:
+    """Each device is given once to be stopped; a cell in lock step never looks."""
+    stops = EmergencyStops(DEVICES, latch(tmp_path))
+    assert stops.at_start() == [] and stops.due == LOOK
+    latch(tmp_path).stop([ALL])
+    assert stops.look(1.0) == list(DEVICES) and stops.look(2.0) == [] and stops.due == 2.0 + LOOK
+    assert EmergencyStops(DEVICES).due == NEVER
+
+
+def test_where_it_lies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside services.toml, then in the user's own folder; where the environment says, there alone."""
+    monkeypatch.delenv(STATE, raising=False)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    beside, own = latch_of(tmp_path / "services.toml", "motion").paths
+    assert beside == tmp_path.resolve() / ".petrobot" / "motion.stopped"
+    assert own.is_relative_to(tmp_path / "state" / "petrobot") and own.name == "motion.stopped"
+    monkeypatch.setenv(STATE, str(tmp_path / "given"))
+    assert latch_of(tmp_path / "services.toml", "motion").paths == (tmp_path / "given" / "motion.stopped",)
