@@ -210,7 +210,9 @@ class Station:
     async def _departed(self, data: Mapping[str, Any]) -> Answer:
         """A simulated run from a point of a recorded one."""
         task, run = await asyncio.to_thread(self._starting_by.departed, data)
-        self._forget(task.name)
+        name = task.name if task.name in self._tasks.names() else ""  # its file may be gone, or called otherwise
+        if name != self._loaded:
+            self._forget(name)
         return self._simulated(run)
 
     def _simulated(self, run: SimulatedRun) -> Answer:

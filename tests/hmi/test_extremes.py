@@ -55,7 +55,7 @@ def crowd(stage: Stage) -> None:
     drawn = stage.feed.state["task"]
     kinds = ("control", "resource", "action")
     like = {p["kind"]: p for p in drawn["places"]}
-    place = {"tokens": 0, "capacity": None, "label": "", "in_macro": "", "args": {}, "error": False}
+    place: dict[str, Any] = {"tokens": 0, "capacity": None, "label": "", "in_macro": "", "args": {}, "error": False}
     places = [
         {
             **like.get(kinds[i % 3], like["control"]),
