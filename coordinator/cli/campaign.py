@@ -98,6 +98,8 @@ def run(options: argparse.Namespace) -> int:
             _refuse_unfit(task, options)
             plan = _plan(options, task)
             folder = options.out or Path("campaigns") / f"{task.name}-{plan.selector}-{plan.seed}-{identity(plan)[:6]}"
+        if options.check is not None:
+            _refuse_misfit(options.check, plan)  # before the work, not after it
         campaign = Campaign(folder, plan, shown)
         with held(folder):
             if campaign.complete and options.json != "-":
@@ -120,6 +122,16 @@ def run(options: argparse.Namespace) -> int:
         print(text_of(result))
         _print_check(check)
     return 0 if check is None or check["agrees"] else 1
+
+
+def _refuse_misfit(forecast: Path, plan: Plan) -> None:
+    from coordinator.cli.forecast import fitting
+    from coordinator.forecast.registered import ForecastError, read
+
+    try:
+        fitting(forecast, read(forecast), plan)
+    except ForecastError as fault:
+        raise CommandError(2, str(fault)) from fault
 
 
 def _checked(forecast: Path, folder: Path) -> dict[str, Any]:

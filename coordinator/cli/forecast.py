@@ -11,6 +11,7 @@ from coordinator.cli import CommandError
 from coordinator.cli.loading import load_task, write_json
 
 if TYPE_CHECKING:
+    from coordinator.campaign.plan import Plan
     from coordinator.forecast.history import Training
     from coordinator.learning.learning import Estimates
     from coordinator.task import Task
@@ -147,6 +148,19 @@ def _compare(registered: Path, folder: Path, options: argparse.Namespace) -> int
     return 0 if found["agrees"] else 1
 
 
+def fitting(registered: Path, forecast: dict[str, Any], plan: Plan) -> Task:
+    """The task of a campaign that may be compared with a registered forecast. Raises CommandError."""
+    task = load_task(plan.task)
+    if task.name != forecast["task"]:
+        raise CommandError(2, f"{registered} forecasts {forecast['task']}, the campaign runs {task.name}")
+    training = forecast["estimates"]
+    if training.get("seed") == plan.seed and training.get("block") == plan.block:
+        raise CommandError(
+            2, f"{registered} was trained on these throws (seed {plan.seed}): run the campaign with another --seed"
+        )
+    return task
+
+
 def compared(registered: Path, folder: Path) -> dict[str, Any]:
     """A registered forecast beside what a campaign measured. Raises CommandError when they do not belong together."""
     from coordinator.campaign.plan import read_manifest
@@ -157,15 +171,7 @@ def compared(registered: Path, folder: Path) -> dict[str, Any]:
     from coordinator.forecast.registered import read
 
     forecast, plan = read(registered), read_manifest(folder)
-    task = load_task(plan.task)
-    if task.name != forecast["task"]:
-        raise CommandError(2, f"{registered} forecasts {forecast['task']}, {folder} ran {task.name}")
-    training = forecast["estimates"]
-    if training.get("seed") == plan.seed and training.get("block") == plan.block:
-        raise CommandError(
-            2,
-            f"{folder} ran the throws that {registered} was trained on (seed {plan.seed}): run it with another --seed",
-        )
+    task = fitting(registered, forecast, plan)
     measured = by_regime(task, read_table(folder / TABLE))
     try:
         found = agreement(forecast, measured)
@@ -177,7 +183,7 @@ def compared(registered: Path, folder: Path) -> dict[str, Any]:
         "forecast": {"file": registered.name, "sha256": forecast["sha256"], "registered_at": forecast["registered_at"]},
         "campaign": {"folder": folder.name, "seed": plan.seed, "began_at": first},
         "registered_before": first is not None and forecast["registered_at"] <= first,
-        "same_block": training.get("block") in (None, plan.block),
+        "same_block": forecast["estimates"].get("block") in (None, plan.block),
         "same_task_file": forecast.get("task_sha256") in (None, plan.digests["task"]),
         **found,
     }

@@ -155,6 +155,7 @@ def test_a_killed_campaign_goes_on(tmp_path: Path) -> None:
         (["campaign", "--resume", "nowhere"], "holds no campaign"),
         (["campaign"], "give a TASK"),
         (["campaign", *TOY, "--learned", "nowhere"], "no finished campaign"),
+        (["campaign", *TOY, "--check", "nowhere.json"], "nowhere.json is no forecast"),
         (["forecast", str(TASK)], "--estimates CAMPAIGN"),
         (["forecast", str(TASK), "--estimates", "nowhere.db"], "holds no estimates"),
         (["forecast", "--compare", "nowhere.json", "nowhere"], "is no forecast"),
