@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from coordinator.drawing.layout import Point
 from coordinator.drawing.routing import Box, Way, Words, place_words, route
@@ -31,15 +32,21 @@ def crossings(ways: list[Way]) -> int:
     return sum(_cross(np.array(a.points), np.array(b.points)) for a, b in apart)
 
 
-def _cross(a: np.ndarray, b: np.ndarray) -> bool:
+Array = NDArray[np.float64]
+
+
+def _side(p: Array, q: Array, r: Array) -> Array:
+    """On which side of the line from p to q the points r lie."""
+    side: Array = (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (r[..., 0] - p[..., 0])
+    return side
+
+
+def _cross(a: Array, b: Array) -> bool:
     if (a.min(0) > b.max(0)).any() or (b.min(0) > a.max(0)).any():
         return False
-
-    def side(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
-        return (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (r[..., 0] - p[..., 0])
-
     a0, a1, b0, b1 = a[:-1, None], a[1:, None], b[None, :-1], b[None, 1:]
-    return bool(((side(a0, a1, b0) * side(a0, a1, b1) < 0) & (side(b0, b1, a0) * side(b0, b1, a1) < 0)).any())
+    over_a = _side(a0, a1, b0) * _side(a0, a1, b1) < 0
+    return bool((over_a & (_side(b0, b1, a0) * _side(b0, b1, a1) < 0)).any())
 
 
 def inside(p: Point, box: Box, margin: float = 0.0) -> bool:
