@@ -209,9 +209,12 @@ def _svg(panels: int, parts: Sequence[str], *, legend: bool = True) -> str:
     width, height = panels * (WIDTH + LEFT + 10.0) + 20.0, TOP + HEIGHT + (70.0 if legend else 44.0)
     names = []
     for number, (action, colour) in enumerate(COLOURS.items() if legend else ()):
-        x, y = LEFT + 190.0 * number, height - 10.0
+        x, y = LEFT + 160.0 * number, height - 10.0
         names.append(f'<circle cx="{x:.0f}" cy="{y - 4:.0f}" r="4" fill="{colour}"/>')
         names.append(f'<text x="{x + 9:.0f}" y="{y:.0f}">{action}</text>')
+    if legend:
+        note = "dots: the campaign that learns; lines: one choice alone, mean and 95 %"
+        names.append(f'<text x="{LEFT + 520.0:.0f}" y="{height - 10.0:.0f}" fill="#555">{note}</text>')
     box, font = f'viewBox="0 0 {width:.0f} {height:.0f}"', 'font-family="sans-serif" font-size="12"'
     head = f'<svg xmlns="http://www.w3.org/2000/svg" {box} {font}>'
     return "\n".join([head, '<rect width="100%" height="100%" fill="#fff"/>', *parts, *names, "</svg>\n"])
