@@ -20,6 +20,7 @@ from coordinator.hmi.journals import opened
 from coordinator.hmi.store import TaskStore
 from coordinator.journal import read_journal
 from coordinator.runfolder import JOURNAL, RESULT
+from coordinator.simulated_run import SimulatedRun
 from coordinator.start_order import StartOrder, read_depart, read_start, start_form
 from coordinator.station import Station
 from coordinator.taskfile import loads
@@ -222,6 +223,10 @@ async def test_a_run_in_lock_step_is_steered(cell: Simulated) -> None:
     answer = await cell.say("start", mode="lockstep", pace=0, runs=4)
     assert answer["ok"], answer
     await cell.until(lambda: cell.state["paused"] is not None)
+    run = cell.station._run
+    assert isinstance(run, SimulatedRun) and run._operation is not None
+    shell = run._operation.shell
+    await cell.until(lambda: cell.state["time"] == shell.now())
     time, fired = cell.state["time"], cell.state["mission"]["firings"]
     for _ in range(20):
         await beat(0.002)
