@@ -56,7 +56,7 @@ class Structure:
             "siphons": [sorted(places[p] for p in s) for s in self.siphons.sets],
             "traps": [sorted(places[p] for p in s) for s in self.traps.sets],
             "siphons_complete": self.siphons.complete and self.traps.complete,
-            "siphons_controlled": controlled_siphons(self.net),
+            "siphons_controlled": controlled_siphons(self.net, found=self.siphons),
             "structurally_bounded": function is not None,
             "conservative": function is not None and function.conserved,
             "strictly_conservative": is_strictly_conservative(self.net),
