@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import configparser
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib.resources import files
 from operator import itemgetter
 from typing import Final
@@ -59,35 +60,46 @@ class Entry:
         return self.access.startswith(("rw", "wo"))
 
 
+@cache
+def _objects(eds: str) -> tuple[Mapping[Key, Entry], Mapping[Key, str]]:
+    """Objects and their default values, as an EDS text writes them: read once, however many devices are of this kind."""
+    parser = configparser.ConfigParser(interpolation=None)
+    parser.read_string(eds)
+    entries: dict[Key, Entry] = {}
+    defaults: dict[Key, str] = {}
+    for name in parser.sections():
+        index, _, sub = name.lower().partition("sub")
+        if parser.has_option(name, "DataType") and len(index) == 4:
+            key, section = (int(index, 16), int(sub or "0", 16)), parser[name]
+            entries[key], defaults[key] = _entry(section), section.get("DefaultValue", "0")
+    return entries, defaults
+
+
+def _entry(section: configparser.SectionProxy) -> Entry:
+    kind = Type(int(section["DataType"], 0))
+    bits = kind.size * 8
+    signed = kind in (Type.INTEGER8, Type.INTEGER16, Type.INTEGER32)
+    low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
+    return Entry(
+        kind,
+        section["AccessType"],
+        int(section.get("LowLimit", str(low)), 0),
+        int(section.get("HighLimit", str(high)), 0),
+        section.get("PDOMapping", "0") == "1",
+    )
+
+
 class Dictionary:
     """Object dictionary of an EDS text: values by (index, sub-index), read and written as an SDO server does."""
 
     def __init__(self, eds: str, node: int) -> None:
-        parser = configparser.ConfigParser(interpolation=None)
-        parser.read_string(eds)
-        self.entries: dict[Key, Entry] = {}
-        self.values: dict[Key, int] = {}
-        for section in parser.sections():
-            index, _, sub = section.lower().partition("sub")
-            if parser.has_option(section, "DataType") and len(index) == 4:
-                self._add((int(index, 16), int(sub or "0", 16)), parser[section], node)
+        self.entries, defaults = _objects(eds)
+        self.values: dict[Key, int] = {
+            key: int(text.removeprefix("$NODEID+"), 0) + (node if text.startswith("$NODEID+") else 0)
+            for key, text in defaults.items()
+        }
         self._defaults = dict(self.values)
         self._records = {index for index, sub in self.entries if sub}
-
-    def _add(self, key: Key, section: configparser.SectionProxy, node: int) -> None:
-        kind = Type(int(section["DataType"], 0))
-        bits = kind.size * 8
-        signed = kind in (Type.INTEGER8, Type.INTEGER16, Type.INTEGER32)
-        low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
-        self.entries[key] = Entry(
-            kind,
-            section["AccessType"],
-            int(section.get("LowLimit", str(low)), 0),
-            int(section.get("HighLimit", str(high)), 0),
-            section.get("PDOMapping", "0") == "1",
-        )
-        text = section.get("DefaultValue", "0")
-        self.values[key] = int(text.removeprefix("$NODEID+"), 0) + (node if text.startswith("$NODEID+") else 0)
 
     def reset(self) -> None:
         """All values as at power-on."""

@@ -5,6 +5,7 @@ The first line is the plan. Whatever else writes to standard output (drivers do)
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import sys
@@ -31,9 +32,14 @@ def answer(plan: str, order: Mapping[str, Any]) -> dict[str, Any]:
 
 def serve(orders: TextIO, answers: TextIO) -> None:
     """Answer each order until there is none."""
-    plan = orders.readline()
+    plan, settled = orders.readline(), False
     for line in orders:
         print(json.dumps(answer(plan, json.loads(line))), file=answers, flush=True)
+        if not settled:
+            # what the first block has loaded stays: the collector need not look through it in every later one
+            settled = True
+            gc.collect()
+            gc.freeze()
 
 
 def main() -> None:
