@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
 import xml.etree.ElementTree as ElementTree
+from pathlib import Path
 
 import pytest
 
+from coordinator.cli import CommandError, show
 from coordinator.drawing import Overlay, draw
 from coordinator.drawing.scene import scene_of_task
 from coordinator.drawing.sheet import sheet_of
@@ -117,3 +120,16 @@ def test_the_page_knows_which_stands_in_which() -> None:
     around = {p["name"]: p["in_macro"] for p in made["places"] if p["kind"] == "macro"}
     assert around == {"inner": "outer", "outer": "", "use": "", "use.g": "use"}
     assert {t["name"]: t["in_macro"] for t in made["transitions"]}["use.s"] == "use"
+
+
+def test_the_command_opens_a_macro_place(tmp_path: Path) -> None:
+    """`petrobot show --inside` draws the inside; a name that is none is bad input and says which there are."""
+    parser = argparse.ArgumentParser()
+    show.add_arguments(parser)
+    task, out = tmp_path / "m.toml", tmp_path / "m.svg"
+    task.write_text(TEXT)
+    assert show.run(parser.parse_args([str(task), "--inside", "outer", "--out", str(out)])) == 0
+    assert "inner work" in out.read_text() and ">m: outer<" in out.read_text()
+    with pytest.raises(CommandError, match="no macro place 'nowhere': inner, outer, use") as caught:
+        show.run(parser.parse_args([str(task), "--inside", "nowhere", "--out", str(out)]))
+    assert caught.value.code == 2
