@@ -165,7 +165,7 @@ _FREE_TEXT = frozenset(("text", "reason"))
 class _Spec:
     """One kind of message: how its fields are read and written."""
 
-    __slots__ = ("checks", "cls", "fields", "limit", "long_checks", "names", "read", "required", "types")
+    __slots__ = ("checks", "cls", "fields", "long_checks", "names", "read", "required", "types")
 
     def __init__(self, cls: type[Message]) -> None:
         described = dataclasses.fields(cls)
@@ -175,7 +175,6 @@ class _Spec:
         self.required = sum(
             field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING for field in described
         )
-        self.limit = LIMITS[cls.KIND]
         self.types = tuple(field.types[0] for field in self.fields)
         self.checks = self._checks(short=True)
         self.long_checks = self._checks(short=False)
@@ -205,7 +204,6 @@ _unpackb = msgpack.unpackb
 def encode(message: Message) -> bytes:
     """Body of a frame, without length and MAC. Raises ProtocolError if the message is no message or too large."""
     kind = message.KIND
-    spec = _SPECS[kind]
     writer = WRITERS.get(kind)
     try:
         if writer is not None:
@@ -213,11 +211,11 @@ def encode(message: Message) -> bytes:
         elif kind == Tick.KIND:
             body = msgpack.packb([kind, *_tick_out(message)], default=_extension)
         else:
-            body = _pack([kind, *spec.read(message)])
+            body = _pack([kind, *_SPECS[kind].read(message)])
     except (TypeError, ValueError, OverflowError) as fault:
         raise ProtocolError("unencodable", f"{type(message).__name__}: {fault}") from None
-    if len(body) > spec.limit:
-        text = f"a {type(message).__name__} of {len(body)} bytes is above its limit of {spec.limit}"
+    if len(body) > LIMITS[kind]:
+        text = f"a {type(message).__name__} of {len(body)} bytes is above its limit of {LIMITS[kind]}"
         raise ProtocolError("too_large", text)
     return body
 

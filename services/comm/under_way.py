@@ -137,9 +137,9 @@ class UnderWay(dict[str, Pending]):
         return min(accept, self._results[0][0]) if self._results else accept
 
     def _drop_past(self) -> None:
-        while self._accepts and self._is_past(self._accepts[0][1]):
-            self._accepts.popleft()
-
-    def _is_past(self, id_: str) -> bool:
-        pending = self.get(id_)
-        return pending is None or pending.accepted
+        accepts, find = self._accepts, self.get
+        while accepts:
+            pending = find(accepts[0][1])
+            if pending is not None and not pending.accepted:
+                break
+            accepts.popleft()

@@ -32,6 +32,7 @@ NEWEST_VERSION: Final = 1
 _HEADER: Final = 4
 _HEAD: Final = struct.Struct(">IBB")
 """Length, then the first two bytes of the body: its array and the kind."""
+_head_at: Final = _HEAD.unpack_from
 _LARGE: Final = 4096
 _NO_QUICK: Mapping[int, int] = {}
 
@@ -193,12 +194,13 @@ class Connection:
 
     def _quick_frames(self, data: bytes, messages: list[Message]) -> int:
         """Take whole frames of an open connection for as long as nothing is unusual about them; says how far it came."""
-        size, start, quick, seal_bytes = len(data), 0, self._quick_in, self._seal_bytes
-        while size - start > _HEAD.size:
-            length, array, kind = _HEAD.unpack_from(data, start)
+        size, start, longest, seal_bytes = len(data), 0, self._quick_in.get, self._seal_bytes
+        last, least = size - _HEAD.size, seal_bytes + 2
+        while start < last:
+            length, array, kind = _head_at(data, start)
             body = start + _HEADER
             end = body + length
-            if end > size or not seal_bytes + 2 <= length <= quick.get(kind, 0) or array & 0xF0 != 0x90:
+            if end > size or not least <= length <= longest(kind, 0) or array & 0xF0 != 0x90:
                 break
             if seal_bytes:
                 messages.append(decode_kind(self._unsealed(data, body, end), kind))
