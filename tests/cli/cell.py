@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-import socket
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from services.action import Context, Result, success
 from services.comm.directory import Directory, parse
-from services.comm.server import Server
 from services.device import Ports
 from services.node import Node
 from services.place import InlinePlace
-from tests.waiting import beat
+from tests.in_loop import NodeInLoop, free_ports
 
 SERVICES = """\
 schema = 1
@@ -174,41 +172,20 @@ async def recover(ctx: Context) -> Result:
     return success()
 
 
-class RobotNode:
+class RobotNode(NodeInLoop):
     """The node, in this loop."""
 
     def __init__(self, directory: Directory) -> None:
         self.directory = directory
         self.arm = Arm({}, None)
-        loop = asyncio.get_running_loop()
-        place = InlinePlace(directory.actions, clock=loop.time, driver=self.arm)
-        self.node = Node(directory, "robot", boot="b1", clock=loop.time, places={"arm": place})
-        self.server = Server(self.node.callee, on_orders=self.node.obey)
-        self._pump: asyncio.Task[None] | None = None
-
-    async def start(self) -> None:
-        """Listen, and do what is due every 4 ms."""
-        await self.server.start(*self.directory.address("robot"))
-        self._pump = asyncio.create_task(self._advance())
-
-    async def _advance(self) -> None:
-        while True:
-            self.node.advance(self.server.now())
-            self.server.flush()
-            await beat(0.004)
-
-    async def close(self) -> None:
-        """Leave."""
-        if self._pump is not None:
-            self._pump.cancel()
-        await self.server.close()
+        clock = asyncio.get_running_loop().time
+        place = InlinePlace(directory.actions, clock=clock, driver=self.arm)
+        node = Node(directory, "robot", boot="b1", clock=clock, places={"arm": place})
+        super().__init__(node, directory.address("robot"))
 
 
 def directory_in(folder: Path) -> Directory:
     """The cell's location file on a free port."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
     path = folder / "services.toml"
-    path.write_text(SERVICES.format(port=port), encoding="utf-8")
+    path.write_text(SERVICES.format(port=free_ports(1)[0]), encoding="utf-8")
     return parse(path.read_text(encoding="utf-8"), path)

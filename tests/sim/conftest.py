@@ -15,13 +15,11 @@ import pytest
 
 from services.comm.canbus import Frame
 from services.comm.canopen import NmtCommand, Type, map_pdo, nmt, sdo_write_request
-from services.comm.channels import can_body, images_wanted, read_can
 from services.comm.cia402 import RECEIVED, SENT, Mode, Object, from_units, to_units
-from services.comm.messages import Call, Hello, Outcome
-from services.comm.party import TICK, Envelope
 from sim.laboratory import Laboratory
 from sim.puma_model import ArmModel
 from sim.site import Site, read_site
+from tests.sim.laboratory_bench import LaboratoryBench
 
 REPOSITORY = Path(__file__).parents[2]
 PARTIES = {"arm": "motion", "camera": "vision"}
@@ -134,73 +132,14 @@ class Master:
         return now >= self._ends
 
 
-class Bench:
-    """A laboratory, its master, and a caller, tick by tick; envelopes take one tick each way."""
+class Bench(LaboratoryBench):
+    """The catching cell's laboratory and its master."""
 
     def __init__(self, site: Site, **options: Any) -> None:
         self.lab = Laboratory("laboratory", site, lambda name: PARTIES.get(name, name), **options)
         self.home: list[float] = site.arm.poses["home"].tolist()
         self.master = Master(site.arm, self.home)
-        self.tick = 0
-        self.images: list[tuple[float, Any]] = []
-        self.answers: list[Outcome] = []
-        self._inbox: list[Envelope] = []
-        self._calls = 0
-        self.post("call", "coordinator", Hello(1, 99, "coordinator", "coordinator", "boot"))
-
-    @property
-    def now(self) -> float:
-        """Time of the next tick (s)."""
-        return self.tick * TICK
-
-    def post(self, channel: str, source: str, body: Any) -> None:
-        """Send an envelope to the laboratory."""
-        self._inbox.append(Envelope("laboratory", source, "laboratory", channel, body))
-
-    def want_images(self, rate: float) -> None:
-        """Ask for images."""
-        self.post("control", "camera", images_wanted(rate, 1))
-
-    def call(self, service: str, **arguments: Any) -> Outcome:
-        """Call a service and wait for its answer."""
-        self._calls += 1
-        self.post("call", "coordinator", Call(f"call-{self._calls}", service, arguments))
-        before = len(self.answers)
-        self.run(lambda: len(self.answers) > before, 0.1)
-        return self.answers[-1]
-
-    def step(self) -> None:
-        """One tick."""
-        now = self.now
-        self.post("can", "arm", can_body(self.master.frames(now)))
-        inbox, self._inbox = self._inbox, []
-        for envelope in inbox:
-            self.lab.receive(now, envelope)
-        self.lab.advance(now)
-        self.tick += 1
-        for envelope in self.lab.drain():
-            if envelope.channel == "can":
-                self.master.take(read_can(envelope.body))
-            elif envelope.channel == "image":
-                self.images.append((self.now, envelope.body))
-            elif isinstance(envelope.body, Outcome):
-                self.answers.append(envelope.body)
-
-    def run(self, until: Callable[[], bool], at_most: float) -> bool:
-        """Step until it holds, at most so many seconds; says whether it held."""
-        for _ in range(round(at_most / TICK)):
-            if until():
-                return True
-            self.step()
-        return until()
-
-    def wait(self, seconds: float) -> None:
-        """Step for so many seconds."""
-        self.run(lambda: False, seconds)
-
-    def enable(self) -> None:
-        """Set up and enable the drives."""
-        assert self.run(lambda: self.master.enabled, 1.0), self.master.status
+        super().__init__(self.lab, self.master, "arm")
 
     def move(self, goal: Sequence[float]) -> None:
         """Lead the arm somewhere and wait until it is there."""

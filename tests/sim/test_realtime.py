@@ -3,13 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
-import os
 import signal
-import socket
-import subprocess
-import sys
-import threading
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
@@ -17,31 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.comm.caller import Caller
 from services.comm.camera import StreamImages
 from services.comm.can_ports import StreamPort
-from services.comm.cell import Delays
-from services.comm.client import Client
 from services.comm.directory import load
-from services.comm.lockstep import Member
-from services.comm.messages import Call, Hello, Outcome
-from services.comm.party import TICK, Envelope
+from services.comm.messages import Call, Outcome
+from services.comm.party import TICK
 from sim.laboratory import Laboratory
 from sim.realtime import LaboratoryShell, bus_channel, camera_address
 from sim.truth import LaboratoryError
-
-REPOSITORY = Path(__file__).parents[2]
-NUMBERS = itertools.count(1)
-PATIENCE = 60.0
-"""s of wall time within which what must come has come, on a machine out of breath."""
-
-
-def free_ports(count: int) -> list[int]:
-    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
-    ports = [one.getsockname()[1] for one in sockets]
-    for one in sockets:
-        one.close()
-    return ports
+from tests.in_loop import free_ports
+from tests.sim.laboratory_shell import PATIENCE, REPOSITORY, call, program, running, score_as_member, until
 
 
 def services_file(folder: Path, extra: str = "") -> Path:
@@ -79,33 +58,14 @@ cell = "{REPOSITORY / "services" / "cell.toml"}"
     return file
 
 
-async def until(holds: Callable[[], bool]) -> None:
-    """Look every 2 ms whether it holds."""
-    pause = threading.Event()
-    async with asyncio.timeout(PATIENCE):
-        while not holds():
-            await asyncio.to_thread(pause.wait, 0.002)
-
-
 @pytest.fixture
 async def shell(tmp_path: Path) -> AsyncIterator[LaboratoryShell]:
-    running = LaboratoryShell(load(services_file(tmp_path)), "laboratory")
-    await running.start()
-    yield running
-    await running.close()
+    async with running(services_file(tmp_path)) as started:
+        yield started
 
 
-async def call(shell: LaboratoryShell, service: str, **arguments: Any) -> Outcome:
-    # a name of its own for each: a caller of one name and boot numbers its calls from 1
-    caller = Caller("laboratory", Hello(1, 99, "client", f"test {next(NUMBERS)}", "boot"))
-    host, port = shell.server.address
-    client = Client(host, port, caller, on_notices=lambda now, notices: None)
-    client.start()
-    try:
-        async with asyncio.timeout(PATIENCE):
-            return await client.call(service, arguments, deadline=PATIENCE)
-    finally:
-        await client.close()
+async def ask(shell: LaboratoryShell, service: str, **arguments: Any) -> Outcome:
+    return await call(shell.server.address, service, **arguments)
 
 
 async def test_world_keeps_pace_with_the_clock(shell: LaboratoryShell) -> None:
@@ -162,26 +122,26 @@ async def test_images_come_with_their_age_and_stop_when_asked(shell: LaboratoryS
 
 
 async def test_services_are_answered(shell: LaboratoryShell) -> None:
-    assert (await call(shell, "laboratory_prepare", seed=7, regime="B+miscalibrated", runs=3)).status == "success"
-    score = await call(shell, "laboratory_score")
+    assert (await ask(shell, "laboratory_prepare", seed=7, regime="B+miscalibrated", runs=3)).status == "success"
+    score = await ask(shell, "laboratory_score")
     assert (score.values["seed"], score.values["regime"], score.values["throws"]) == (7, "B+miscalibrated", [])
-    assert (await call(shell, "laboratory_fault", kind="slow_arm", factor=0.5)).status == "success"
-    refused = await call(shell, "laboratory_prepare", regime="Q")
+    assert (await ask(shell, "laboratory_fault", kind="slow_arm", factor=0.5)).status == "success"
+    refused = await ask(shell, "laboratory_prepare", regime="Q")
     assert refused.status == "error" and "must begin with" in refused.text
 
 
 async def test_a_fault_of_the_world_ends_the_shell(tmp_path: Path) -> None:
-    running = LaboratoryShell(load(services_file(tmp_path)), "laboratory")
+    failing = LaboratoryShell(load(services_file(tmp_path)), "laboratory")
 
     def fails(now: float) -> None:
         raise RuntimeError("the world came to its end")
 
-    running.laboratory.tick = fails  # type: ignore[method-assign]
-    await running.start()
+    failing.laboratory.tick = fails  # type: ignore[method-assign]
+    await failing.start()
     async with asyncio.timeout(PATIENCE):
-        await running.over.wait()
+        await failing.over.wait()
     with pytest.raises(RuntimeError, match="came to its end"):
-        await running.close()
+        await failing.close()
 
 
 @pytest.mark.parametrize(
@@ -203,18 +163,6 @@ def test_two_buses_or_cameras_are_one_too_many(tmp_path: Path, extra: str, says:
 # Processes
 
 
-def program(*arguments: str) -> subprocess.Popen[str]:
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-    return subprocess.Popen(
-        [sys.executable, "-m", "sim", *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=environment,
-        cwd=REPOSITORY,
-    )
-
-
 @pytest.mark.processes
 def test_the_process_says_ready_and_ends_on_sigterm(tmp_path: Path) -> None:
     process = program("--services", str(services_file(tmp_path)))
@@ -228,27 +176,6 @@ def test_the_process_says_ready_and_ends_on_sigterm(tmp_path: Path) -> None:
         process.communicate()
 
 
-class Looker:
-    """A party that asks for the score and ends the cell when it has it."""
-
-    name = "coordinator"
-
-    def __init__(self) -> None:
-        self.score: dict[str, Any] = {}
-        self._out = [Hello(1, 99, "coordinator", "coordinator", "boot"), Call("1", "laboratory_score")]
-
-    def receive(self, now: float, envelope: Envelope) -> None:
-        if isinstance(envelope.body, Outcome):
-            self.score = dict(envelope.body.values)
-
-    def advance(self, now: float) -> None:
-        pass
-
-    def drain(self) -> list[Envelope]:
-        out, self._out = self._out, []
-        return [Envelope("laboratory", self.name, "laboratory", "call", body) for body in out]
-
-
 @pytest.mark.processes
 def test_it_is_a_member_of_a_lock_step_cell(tmp_path: Path) -> None:
     extra = f'[coordinator]\nhost = "127.0.0.1"\nport = {free_ports(1)[0]}'
@@ -258,14 +185,8 @@ def test_it_is_a_member_of_a_lock_step_cell(tmp_path: Path) -> None:
     file.write_text(lone)
     directory = load(file)
     process = program("--services", str(file), "--lockstep")
-    looker = Looker()
-    member = Member(
-        "coordinator", [looker], directory.members(), delays=Delays({}), directory=directory.hash, patience=PATIENCE
-    )
     try:
-        member.open()
-        member.run(lambda: bool(looker.score), 1000)
-        assert looker.score["regime"] == "A"
+        assert score_as_member(directory, [Call("1", "laboratory_score")])["regime"] == "A"
         assert process.wait(PATIENCE) == 0
     finally:
         process.kill()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import socket
 from collections.abc import AsyncIterator, Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,10 +12,10 @@ import pytest_asyncio
 from coordinator.hmi.store import TaskStore
 from coordinator.station import Station
 from services.comm.directory import Directory, parse
-from services.comm.server import Server
 from services.node import GENERAL, Node
 from services.place import InlinePlace
 from services.scripted import load
+from tests.in_loop import NodeInLoop, free_ports
 from tests.waiting import beat
 
 SERVICES = """\
@@ -110,34 +109,12 @@ out = ["arm_free"]
 """
 
 
-class ToyNode:
+def toy_node(directory: Directory, name: str, script: Mapping[str, Callable[..., Any]]) -> NodeInLoop:
     """A node, in this loop."""
-
-    def __init__(self, directory: Directory, name: str, script: Mapping[str, Callable[..., Any]]) -> None:
-        clock = asyncio.get_running_loop().time
-        place = InlinePlace(directory.actions, clock=clock, substitutes=script)
-        self.node = Node(directory, name, boot=f"{name} 1", clock=clock, places={GENERAL: place})
-        self.server = Server(self.node.callee, on_orders=self.node.obey)
-        self._address = directory.address(name)
-        self._pump: asyncio.Task[None] | None = None
-
-    async def start(self) -> None:
-        """Listen, and do what is due every 4 ms."""
-        await self.server.start(*self._address)
-        self._pump = asyncio.create_task(self._advance())
-
-    async def _advance(self) -> None:
-        while True:
-            self.node.advance(self.server.now())
-            self.server.flush()
-            await beat(0.004)
-
-    async def close(self) -> None:
-        """Leave."""
-        if self._pump is not None:
-            self._pump.cancel()
-            await asyncio.gather(self._pump, return_exceptions=True)
-        await self.server.close()
+    clock = asyncio.get_running_loop().time
+    place = InlinePlace(directory.actions, clock=clock, substitutes=script)
+    node = Node(directory, name, boot=f"{name} 1", clock=clock, places={GENERAL: place})
+    return NodeInLoop(node, directory.address(name))
 
 
 class Cell:
@@ -145,11 +122,11 @@ class Cell:
 
     def __init__(self, folder: Path) -> None:
         path = folder / "services.toml"
-        path.write_text(SERVICES.format(*_free_ports()), encoding="utf-8")
+        path.write_text(SERVICES.format(*free_ports(2)), encoding="utf-8")
         (folder / "script.toml").write_text(SCRIPT, encoding="utf-8")
         script = load(folder / "script.toml")
         self.directory = parse(path.read_text(encoding="utf-8"), path)
-        self.nodes = {name: ToyNode(self.directory, name, script) for name in self.directory.nodes}
+        self.nodes = {name: toy_node(self.directory, name, script) for name in self.directory.nodes}
         self.tasks = TaskStore(folder / "tasks")
         self.tasks.save_text("moving", None, TASK)
         self.runs = folder / "runs"
@@ -174,16 +151,6 @@ class Cell:
         """Wait for the run's end; its result."""
         await self.until(lambda: self.state["result"] is not None)
         return self.state["result"]  # type: ignore[no-any-return]
-
-
-def _free_ports() -> list[int]:
-    probes = [socket.socket() for _ in range(2)]
-    for probe in probes:
-        probe.bind(("127.0.0.1", 0))
-    ports = [probe.getsockname()[1] for probe in probes]
-    for probe in probes:
-        probe.close()
-    return ports
 
 
 @pytest_asyncio.fixture

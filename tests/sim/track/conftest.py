@@ -12,12 +12,12 @@ import pytest
 
 from services.comm.canbus import Frame
 from services.comm.canopen import SYNC, NmtCommand, Type, map_pdo, nmt, pdo_struct, sdo_read_request, sdo_write_request
-from services.comm.channels import can_body, images_wanted, read_can
+from services.comm.channels import can_body
 from services.comm.cia402 import SENT, VELOCITY_RECEIVED, Mode, Object, to_units
-from services.comm.messages import Call, Hello, Outcome
-from services.comm.party import TICK, Envelope
+from services.comm.party import TICK
 from sim.track_laboratory import TrackLaboratory
 from sim.track_truth import TrackSite, read_track_site
+from tests.sim.laboratory_bench import LaboratoryBench
 
 REPOSITORY = Path(__file__).parents[3]
 ROVER_FILE = REPOSITORY / "services" / "mobile" / "rover.toml"
@@ -60,7 +60,7 @@ class RoverMaster:
         groups.append([sdo_write_request(3, 0x1800, 1, Type.UNSIGNED32.pack(0x183))])
         return [*groups, [nmt(NmtCommand.START)]]
 
-    def frames(self) -> list[Frame]:
+    def frames(self, now: float = 0.0) -> list[Frame]:
         """Frames of a cycle: set points and SYNC."""
         if self._setup:
             return self._setup.pop(0)
@@ -93,41 +93,15 @@ class RoverMaster:
         return all(word & 0x6F == 0x27 for word in self.status)
 
 
-class RoverBench:
-    """A laboratory, its master and a caller, tick by tick; envelopes take one tick each way."""
+class RoverBench(LaboratoryBench):
+    """The rover's laboratory, its master, and a driver who sees the truth."""
+
+    cycle = SYNC_TICKS
 
     def __init__(self, site: TrackSite, **options: Any) -> None:
         self.lab = TrackLaboratory("laboratory", site, lambda name: PARTIES.get(name, name), **options)
         self.master = RoverMaster()
-        self.tick = 0
-        self.images: list[Any] = []
-        self.answers: list[Outcome] = []
-        self.cut = False
-        """Whether the master is silent."""
-        self._inbox: list[Envelope] = []
-        self._calls = 0
-        self.post("call", "coordinator", Hello(1, 99, "coordinator", "coordinator", "boot"))
-
-    @property
-    def now(self) -> float:
-        """Time of the next tick (s)."""
-        return self.tick * TICK
-
-    def post(self, channel: str, source: str, body: Any) -> None:
-        """Send an envelope to the laboratory."""
-        self._inbox.append(Envelope("laboratory", source, "laboratory", channel, body))
-
-    def want_images(self, rate: float) -> None:
-        """Ask for images."""
-        self.post("control", "camera", images_wanted(rate, 1))
-
-    def call(self, service: str, **arguments: Any) -> Outcome:
-        """Call a service and wait for its answer."""
-        self._calls += 1
-        self.post("call", "coordinator", Call(f"call-{self._calls}", service, arguments))
-        before = len(self.answers)
-        self.run(lambda: len(self.answers) > before, 0.1)
-        return self.answers[-1]
+        super().__init__(self.lab, self.master, "rover")
 
     def read(self, node: int, index: int, kind: Type) -> int:
         """An object of a node, over SDO."""
@@ -135,40 +109,6 @@ class RoverBench:
         self.post("can", "rover", can_body([sdo_read_request(node, index, 0)]))
         assert self.run(lambda: (node, index) in self.master.replies, 0.1)
         return kind.unpack(self.master.replies[node, index][: kind.size])
-
-    def step(self) -> None:
-        """One tick."""
-        now = self.now
-        if self.tick % SYNC_TICKS == 0 and not self.cut:
-            self.post("can", "rover", can_body(self.master.frames()))
-        inbox, self._inbox = self._inbox, []
-        for envelope in inbox:
-            self.lab.receive(now, envelope)
-        self.lab.advance(now)
-        self.tick += 1
-        for envelope in self.lab.drain():
-            if envelope.channel == "can":
-                self.master.take(read_can(envelope.body))
-            elif envelope.channel == "image":
-                self.images.append(envelope.body)
-            elif isinstance(envelope.body, Outcome):
-                self.answers.append(envelope.body)
-
-    def run(self, until: Callable[[], bool], at_most: float) -> bool:
-        """Step until it holds, at most so many seconds; says whether it held."""
-        for _ in range(round(at_most / TICK)):
-            if until():
-                return True
-            self.step()
-        return until()
-
-    def wait(self, seconds: float) -> None:
-        """Step for so many seconds."""
-        self.run(lambda: False, seconds)
-
-    def enable(self) -> None:
-        """Set up and enable the drives."""
-        assert self.run(lambda: self.master.enabled, 1.0), self.master.status
 
     def drive(self, speed: float, turn: float) -> None:
         """From now on so fast (m/s, rad/s), as a driver with the nominal numbers would."""

@@ -103,8 +103,8 @@ def test_images_come_at_their_rate_with_their_age(rover_bench: Bench) -> None:
     bench.want_images(25.0)
     bench.wait(2.0)
     assert len(bench.images) == pytest.approx(50, abs=1)
-    assert all(0.008 <= body["age"] <= 0.013 for body in bench.images)
-    assert {body["pixels"].shape for body in bench.images} == {(120, 160)}
+    assert all(0.008 <= body["age"] <= 0.013 for _, body in bench.images)
+    assert {body["pixels"].shape for _, body in bench.images} == {(120, 160)}
     count = len(bench.images)
     bench.want_images(0.0)
     bench.wait(1.0)
@@ -285,7 +285,7 @@ def digest(rover_bench: Bench, seed: int, prepare_first: bool) -> str:
     bench.want_images(25.0)
     score = bench.follow(0.5, end=5.0)
     told = hashlib.sha256(json.dumps([score["path"][-5:], score["rms_mm"], bench.master.echoes[-20:]]).encode())
-    for body in bench.images[-20:]:
+    for _, body in bench.images[-20:]:
         told.update(body["pixels"].tobytes())
     return told.hexdigest()
 

@@ -3,13 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
 import os
 import signal
-import socket
-import subprocess
-import sys
-import threading
 import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
@@ -17,32 +12,21 @@ from typing import Any
 
 import pytest
 
-from services.comm.caller import Caller
 from services.comm.camera import StreamImages
 from services.comm.can_ports import StreamPort
-from services.comm.cell import Delays
-from services.comm.client import Client
 from services.comm.directory import load
-from services.comm.lockstep import Member
-from services.comm.messages import Call, Hello, Outcome
-from services.comm.party import Envelope
+from services.comm.messages import Call
 from sim.realtime import LaboratoryShell, bus_channel, camera_address
 from sim.track import Track
 from sim.track_laboratory import TrackLaboratory
 from sim.truth import LaboratoryError
-
-REPOSITORY = Path(__file__).parents[3]
-NUMBERS = itertools.count(1)
-PATIENCE = 60.0
-"""s of wall time within which what must come has come, on a machine out of breath."""
+from tests.in_loop import free_ports
+from tests.sim.laboratory_shell import PATIENCE, REPOSITORY, call, program, running, score_as_member, until
 
 
 def services_file(folder: Path, sim: str = "sim.track_laboratory:make_laboratory") -> Path:
     """The shipped location file with free ports, its devices named by hand."""
-    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(4)]
-    node, bus, camera, coordinator = (one.getsockname()[1] for one in sockets)
-    for one in sockets:
-        one.close()
+    node, bus, camera, coordinator = free_ports(4)
     file = folder / "services.toml"
     file.write_text(f"""\
 schema = 1
@@ -75,32 +59,10 @@ rover = "{REPOSITORY / "services" / "mobile" / "rover.toml"}"
     return file
 
 
-async def until(holds: Callable[[], bool]) -> None:
-    """Look every 2 ms whether it holds."""
-    pause = threading.Event()
-    async with asyncio.timeout(PATIENCE):
-        while not holds():
-            await asyncio.to_thread(pause.wait, 0.002)
-
-
 @pytest.fixture
 async def shell(tmp_path: Path) -> AsyncIterator[LaboratoryShell]:
-    running = LaboratoryShell(load(services_file(tmp_path)), "laboratory")
-    await running.start()
-    yield running
-    await running.close()
-
-
-async def call(address: tuple[str, int], service: str, **arguments: Any) -> Outcome:
-    # a name of its own for each: a caller of one name and boot numbers its calls from 1
-    caller = Caller("laboratory", Hello(1, 99, "client", f"test {next(NUMBERS)}", "boot"))
-    client = Client(*address, caller, on_notices=lambda now, notices: None)
-    client.start()
-    try:
-        async with asyncio.timeout(PATIENCE):
-            return await client.call(service, arguments, deadline=PATIENCE)
-    finally:
-        await client.close()
+    async with running(services_file(tmp_path)) as started:
+        yield started
 
 
 async def test_the_rover_drives_over_the_bus(shell: LaboratoryShell, rover_master: Callable[[], Any]) -> None:
@@ -175,9 +137,7 @@ def test_what_makes_no_laboratory_is_refused(tmp_path: Path, monkeypatch: pytest
 def test_as_a_process_it_serves_until_told_to_end(tmp_path: Path) -> None:
     file = services_file(tmp_path)
     directory = load(file)
-    process = subprocess.Popen(
-        [sys.executable, "-m", "sim", "--services", str(file)], cwd=REPOSITORY, stdout=subprocess.PIPE, text=True
-    )
+    process = program("--services", str(file))
     try:
         assert process.stdout is not None
         assert "ready" in process.stdout.readline()
@@ -187,32 +147,8 @@ def test_as_a_process_it_serves_until_told_to_end(tmp_path: Path) -> None:
         assert (score["interruptions"], score["finished"]) == (3, False)
     finally:
         os.kill(process.pid, signal.SIGTERM)
-        assert process.wait(PATIENCE) == 0
-        if process.stdout is not None:
-            process.stdout.close()
-
-
-class Looker:
-    """A party that asks for a new experiment and its score, and ends the cell when it has that."""
-
-    name = "coordinator"
-
-    def __init__(self) -> None:
-        self.score: dict[str, Any] = {}
-        hello = Hello(1, 99, "coordinator", self.name, "boot")
-        prepare = Call("1", "laboratory_prepare", {"seed": 6, "regime": "contest"})
-        self._out: list[Any] = [hello, prepare, Call("2", "laboratory_score")]
-
-    def receive(self, now: float, envelope: Envelope) -> None:
-        if isinstance(envelope.body, Outcome) and envelope.body.id == "2":
-            self.score = dict(envelope.body.values)
-
-    def advance(self, now: float) -> None:
-        pass
-
-    def drain(self) -> list[Envelope]:
-        out, self._out = self._out, []
-        return [Envelope("laboratory", self.name, "laboratory", "call", body) for body in out]
+        process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0
 
 
 @pytest.mark.processes
@@ -223,17 +159,13 @@ def test_it_is_a_member_of_a_lock_step_cell(tmp_path: Path) -> None:
     alone = text[: text.index("[nodes.drive]")] + text[text.index("[services.laboratory_prepare]") :]
     file.write_text(f'{alone}[coordinator]\nhost = "127.0.0.1"\nport = {port}\n')
     directory = load(file)
-    process = subprocess.Popen([sys.executable, "-m", "sim", "--services", str(file), "--lockstep"], cwd=REPOSITORY)
-    looker = Looker()
-    member = Member(
-        "coordinator", [looker], directory.members(), delays=Delays({}), directory=directory.hash, patience=PATIENCE
-    )
+    process = program("--services", str(file), "--lockstep")
+    calls = [Call("1", "laboratory_prepare", {"seed": 6, "regime": "contest"}), Call("2", "laboratory_score")]
     try:
-        member.open()
-        member.run(lambda: bool(looker.score), 1000)
-        assert looker.score["regime"] == "contest"
-        assert looker.score["track"] == Track.contest().plain()
+        score = score_as_member(directory, calls)
+        assert score["regime"] == "contest"
+        assert score["track"] == Track.contest().plain()
         assert process.wait(PATIENCE) == 0
     finally:
         process.kill()
-        process.wait(PATIENCE)
+        process.communicate()

@@ -1,0 +1,101 @@
+"""A laboratory on the wall clock in tests: free ports, callers, `python -m sim` as a process, a party that looks at its score."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+from services.comm.caller import Caller
+from services.comm.cell import Delays
+from services.comm.client import Client
+from services.comm.directory import Directory, load
+from services.comm.lockstep import Member
+from services.comm.messages import Call, Hello, Outcome
+from services.comm.party import Envelope
+from sim.realtime import LaboratoryShell
+
+REPOSITORY = Path(__file__).parents[2]
+NUMBERS = itertools.count(1)
+PATIENCE = 60.0
+"""s of wall time within which what must come has come, on a machine out of breath."""
+
+
+async def until(holds: Callable[[], bool]) -> None:
+    """Look every 2 ms whether it holds."""
+    pause = threading.Event()
+    async with asyncio.timeout(PATIENCE):
+        while not holds():
+            await asyncio.to_thread(pause.wait, 0.002)
+
+
+@asynccontextmanager
+async def running(file: Path) -> AsyncIterator[LaboratoryShell]:
+    """The laboratory of a location file in this process."""
+    shell = LaboratoryShell(load(file), "laboratory")
+    await shell.start()
+    yield shell
+    await shell.close()
+
+
+async def call(address: tuple[str, int], service: str, **arguments: Any) -> Outcome:
+    """Call a service, under a name of its own: a caller of one name and boot numbers its calls from 1."""
+    caller = Caller("laboratory", Hello(1, 99, "client", f"test {next(NUMBERS)}", "boot"))
+    client = Client(*address, caller, on_notices=lambda now, notices: None)
+    client.start()
+    try:
+        async with asyncio.timeout(PATIENCE):
+            return await client.call(service, arguments, deadline=PATIENCE)
+    finally:
+        await client.close()
+
+
+def program(*arguments: str) -> subprocess.Popen[str]:
+    """`python -m sim` with these arguments."""
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    command = [sys.executable, "-m", "sim", *arguments]
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, cwd=REPOSITORY
+    )
+
+
+class Looker:
+    """A party that makes some calls, ends the cell when all are answered, and keeps what the last one, the score, says."""
+
+    name = "coordinator"
+
+    def __init__(self, calls: Sequence[Call]) -> None:
+        self.score: dict[str, Any] = {}
+        self._last = calls[-1].id
+        self._out: list[Any] = [Hello(1, 99, "coordinator", self.name, "boot"), *calls]
+
+    def receive(self, now: float, envelope: Envelope) -> None:
+        """Keep the score."""
+        if isinstance(envelope.body, Outcome) and envelope.body.id == self._last:
+            self.score = dict(envelope.body.values)
+
+    def advance(self, now: float) -> None:
+        """Nothing is due."""
+
+    def drain(self) -> list[Envelope]:
+        """The calls, once."""
+        out, self._out = self._out, []
+        return [Envelope("laboratory", self.name, "laboratory", "call", body) for body in out]
+
+
+def score_as_member(directory: Directory, calls: Sequence[Call]) -> dict[str, Any]:
+    """Be the coordinator of a lock-step cell whose laboratory is a process; gives the answer to the last call."""
+    looker = Looker(calls)
+    member = Member(
+        "coordinator", [looker], directory.members(), delays=Delays({}), directory=directory.hash, patience=PATIENCE
+    )
+    member.open()
+    member.run(lambda: bool(looker.score), 1000)
+    return looker.score
