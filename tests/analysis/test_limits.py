@@ -55,7 +55,7 @@ def answered(process: subprocess.Popen[str], *, proven: bool = False) -> dict[st
 
 @pytest.mark.parametrize(
     ("net", "deadlock"),
-    [(philosophers(60), True), (kanban(50), False), (ring(300, 20), False)],
+    [pytest.param(philosophers(60), True, marks=pytest.mark.proof), (kanban(50), False), (ring(300, 20), False)],
     ids=["300 places", "1e16", "ring"],
 )
 def test_what_has_no_end_in_sight_ends_with_an_honest_part(net: Net, deadlock: bool, tmp_path: Path) -> None:
@@ -83,7 +83,7 @@ def test_what_cannot_be_solved_can_be_played(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("net", [philosophers(60), kanban(5)], ids=["300 places", "2.5 million markings"])
-@pytest.mark.parametrize("share", [0.2, 1.0])
+@pytest.mark.parametrize("share", [0.2, pytest.param(1.0, marks=pytest.mark.proof)])
 def test_ctrl_c_leaves_what_was_known(net: Net, share: float, tmp_path: Path) -> None:
     """At two moments after the search has begun, told by the processor time that it has taken."""
     process = started(net, tmp_path, "analyse", "--rates", "unit", "--json", "-")
