@@ -67,7 +67,8 @@ def empty_siphon(net: Net, marking: Marking) -> frozenset[int]:
 def controlled_siphons(net: Net, effort: int = EFFORT, found: PlaceSets | None = None) -> bool | None:
     """Whether every minimal siphon contains a trap marked initially (Commoner's condition); None if effort ran out.
 
-    `found` are its minimal siphons if they are at hand. In a net with weight-1 arcs, without inhibitors, capacities and priorities, that rules out a dead marking.
+    `found` are its minimal siphons if they are at hand. In a net with weight-1 arcs, without inhibitors, capacities and
+    priorities, that rules out a dead marking.
     """
     found = found or minimal_siphons(net, effort)
     if any(not any(net.initial[p] for p in largest_trap(net, siphon)) for siphon in found.sets):
