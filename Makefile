@@ -35,14 +35,14 @@ proof: $(VENV)/.ready
 	$(BIN)/python -m tests.proof
 
 bench: $(VENV)/.ready
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[test,bench]"
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[test,bench,fast,oracle]"
 	$(BIN)/python tests/bench/wire.py
 	$(BIN)/python tests/bench/faults.py
 	$(BIN)/python tests/bench/estop.py
 	$(BIN)/python tests/bench/doors.py
 	$(BIN)/python tests/bench/journal.py
 	$(BIN)/python tests/bench/durability.py
-	$(BIN)/python -m tests.bench.analysis
+	$(BIN)/python -m tests.bench.analysis --write docs/figures-analysis.md
 	$(BIN)/python -m tests.bench.learning
 
 clean:

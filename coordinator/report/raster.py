@@ -1,4 +1,4 @@
-"""Pictures of a report as PNG, for papers and mails that take no SVG: rendered by resvg (extra `png`), twice the size of the SVG.
+"""Pictures of a report as PNG, for papers and mails that take no SVG: rendered by resvg, twice the size of the SVG.
 
 resvg is one wheel that needs nothing of the system but its fonts; a browser or Cairo would have to be installed apart, and OpenCV
 draws no SVG.
@@ -13,7 +13,7 @@ from typing import Any
 SCALE = 2.0
 """Pixels of the PNG for one of the SVG: sharp on dense screens and in print."""
 PAPER = "#ffffff"
-REMEDY = 'pip install "petrobot[png]"'
+REMEDY = 'pip install "resvg-py>=0.5,<1"'
 _PROBE = '<svg xmlns="http://www.w3.org/2000/svg" width="40" height="20"><text y="15" font-family="sans-serif">{}</text></svg>'
 
 

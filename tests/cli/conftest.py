@@ -45,9 +45,17 @@ class Said(NamedTuple):
 class Terminal:
     """The commands of operators, in threads of their own; this loop serves them meanwhile."""
 
-    def __init__(self, operation: Operation, page: Page, robot: RobotNode, folder: Path, read: Callable[[], Any]):
+    def __init__(
+        self,
+        operation: Operation,
+        shell: RealtimeMission,
+        page: Page,
+        robot: RobotNode,
+        folder: Path,
+        read: Callable[[], Any],
+    ):
         self.operation = operation
-        self.shell = operation.shell
+        self.shell = shell
         self.page = page
         self.robot = robot
         self.folder = folder
@@ -106,7 +114,7 @@ async def cell_of(folder: Path, read: Callable[[], Any]) -> AsyncIterator[Termin
     running = asyncio.create_task(shell.run())
     door = Door(RUN, page.base, page.token, os.getpid(), str(directory.source))
     with door_open(folder / "runs" / RUN, door):
-        yield Terminal(operation, page, robot, folder, read)
+        yield Terminal(operation, shell, page, robot, folder, read)
     running.cancel()
     await asyncio.gather(running, return_exceptions=True)
     await page.close()
