@@ -7,7 +7,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
-from coordinator.cli.parameters import parameter_of
+from coordinator.cli.parameters import pairs, parameter_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -50,8 +50,8 @@ def add_departing_arguments(parser: argparse.ArgumentParser) -> None:
 
 def depart(options: argparse.Namespace) -> int:
     """Simulate from the point; the exit code says whether the task reached its end."""
+    from coordinator.cli.giving import give, progress
     from coordinator.cli.lockstep import in_one_process, substitutes
-    from coordinator.cli.run import give, progress
     from coordinator.journal import JournalError
     from coordinator.mission import MissionError
 
@@ -113,7 +113,6 @@ def _going(texts: list[str]) -> dict[str, str] | str:
 
 
 def _setting(found: Recorded, departure: Departure, options: argparse.Namespace) -> Setting:
-    from coordinator.cli.run import pairs
     from coordinator.departure import departing
 
     given = dict(pairs("--set", options.set))

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 from coordinator.cli import CommandError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from coordinator.task import Task
 
 
@@ -24,3 +26,12 @@ def parameter_of(task: Task, name: str, text: str) -> Any:
         return type(default)(text) if isinstance(default, int | float) else text
     except ValueError as fault:
         raise CommandError(2, f"parameter {name}: {text!r} is no {type(default).__name__}") from fault
+
+
+def pairs(option: str, texts: list[str]) -> Iterator[tuple[str, str]]:
+    """NAME=VALUE as users write it. Raises CommandError."""
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise CommandError(2, f"{option} {text}: write NAME=VALUE")
+        yield name, value

@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Resume."""
-    from coordinator.cli.run import give
+    from coordinator.cli.giving import give
     from coordinator.journal import JournalError
     from coordinator.mission import MissionError
     from coordinator.recording import ReplayError
@@ -63,9 +63,9 @@ def run(options: argparse.Namespace) -> int:
 
 def _resume_lockstep(found: Recorded, options: argparse.Namespace) -> tuple[Mission, Timeline, dict[str, Any]]:
     """Nodes that wait for their coordinator are joined; a cell that ended with it is made again from its seed."""
+    from coordinator.cli.giving import progress
     from coordinator.cli.learning import resumed_selector, saved
     from coordinator.cli.lockstep import JOINED, rejoin, retrace
-    from coordinator.cli.run import progress
 
     selector, session = resumed_selector(found.task, found.journal.header)
     with saved(session) as learned, progress(options) as watch:

@@ -7,13 +7,14 @@ import asyncio
 import os
 import sys
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import AbstractAsyncContextManager, asynccontextmanager, contextmanager, nullcontext
+from collections.abc import AsyncIterator, Callable
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
 from coordinator.cli.departing import add_departing_arguments, depart
+from coordinator.cli.giving import give, progress
 from coordinator.cli.journaling import add_journal_arguments, journal_folder, new_store, tidy
 from coordinator.cli.learning import add_learning_arguments, opened, saved
 from coordinator.cli.loading import (
@@ -21,11 +22,9 @@ from coordinator.cli.loading import (
     cell_path,
     load_directory,
     load_task,
-    pictures_of,
     refuse_misplaced,
-    write_json,
 )
-from coordinator.cli.parameters import parameter_of
+from coordinator.cli.parameters import pairs, parameter_of
 
 if TYPE_CHECKING:
     from coordinator.launch import Setting
@@ -176,15 +175,6 @@ def _setting(task: Task, directory: Directory, options: argparse.Namespace) -> S
     return Setting(task, parameters, options.runs, options.seed, selector)
 
 
-def pairs(option: str, texts: list[str]) -> Iterator[tuple[str, str]]:
-    """NAME=VALUE as users write it. Raises CommandError."""
-    for text in texts:
-        name, equals, value = text.partition("=")
-        if not equals:
-            raise CommandError(2, f"{option} {text}: write NAME=VALUE")
-        yield name, value
-
-
 # --- lock step ---------------------------------------------------------------------------------------------------------
 
 
@@ -299,43 +289,3 @@ async def _watched(running: Any, mission: Mission, watch: Callable[[Mission, flo
             watch(mission, asyncio.get_running_loop().time())
         await asyncio.wait({task}, timeout=0.1)
     await task
-
-
-# --- what people see ---------------------------------------------------------------------------------------------------
-
-
-@contextmanager
-def progress(options: argparse.Namespace) -> Iterator[Callable[[Mission, float], None] | None]:
-    if options.quiet or options.json == "-":
-        yield None
-        return
-    from coordinator.cli.progress import live_progress
-
-    with live_progress() as watch:
-        yield watch
-
-
-def give(
-    result: dict[str, Any], task: Task, timeline: Timeline, options: argparse.Namespace, folder: Path | None
-) -> None:
-    """Write the result where it was asked for and beside the journal, print it, leave the report."""
-    if folder is not None:
-        from coordinator.runfolder import RESULT
-
-        write_json(str(folder / RESULT), result)
-    if options.json:
-        write_json(options.json, result)
-    if options.json != "-":
-        from coordinator.cli.progress import print_result
-
-        print_result(result)
-    if options.report is not None:
-        from coordinator.drawing import draw
-        from coordinator.report import report_html
-
-        options.report.mkdir(parents=True, exist_ok=True)
-        write_json(str(options.report / "result.json"), result)
-        page = options.report / "index.html"
-        net = draw(task, error_branches=True)
-        page.write_text(report_html(result, timeline, net, pictures_of(task, result)), encoding="utf-8")
-        print(f"report: {page}")

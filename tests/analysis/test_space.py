@@ -108,10 +108,12 @@ def test_fields_grow_with_the_tokens(kind: str) -> None:
 
 
 @pytest.mark.parametrize("engine", ["integers", "numpy"])
-def test_more_tokens_than_a_word_can_count_are_refused(engine: EngineName) -> None:
+def test_more_tokens_than_a_word_can_count_end_the_search(engine: EngineName) -> None:
+    """What was found before is kept, marked as a part; an initial marking that no word can count is refused."""
     huge = Net.build({"p": 1}, {"grow": ({"p": 1}, {"p": (1 << 62) + 1})})
-    with pytest.raises(TooManyTokens, match="unbounded"):
-        explore(huge, engine=engine)
+    part = explore(huge, engine=engine)
+    assert not part.complete and "unbounded" in part.reason
+    assert part.tokens(0).tolist() == [1, (1 << 62) + 1]
     with pytest.raises(TooManyTokens, match="at most 63"):
         explore(Net.build({"p": 1 << 64}, {}), engine=engine)
 

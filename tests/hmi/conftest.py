@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 import pytest_asyncio
@@ -18,6 +18,9 @@ from coordinator.hmi.server import Page, start_page
 from coordinator.task import Executed, Status
 from coordinator.taskfile import load
 from tests.hmi.stage import Part, Stage
+
+if TYPE_CHECKING:
+    from playwright.async_api import Browser
 
 HERE = Path(__file__).parent
 BROWSER = Path(os.environ.get("PETROBOT_BROWSER", "/usr/bin/chromium"))
@@ -110,3 +113,24 @@ def faults() -> Callable[[Any], list[str]]:
         return found
 
     return watch
+
+
+@pytest_asyncio.fixture(scope="module", loop_scope="module")
+async def browser() -> AsyncIterator[Browser]:
+    """Chromium without a window, one for all tests of a file."""
+    if browser_missing():
+        pytest.fail(browser_missing())
+    from playwright.async_api import async_playwright
+
+    async with async_playwright() as driver:
+        launched = await driver.chromium.launch(executable_path=str(BROWSER), args=ARGUMENTS)
+        yield launched
+        await launched.close()
+
+
+@pytest_asyncio.fixture(loop_scope="module")
+async def _windows_are_closed(browser: Browser) -> AsyncIterator[None]:
+    """No window of one test goes on painting during the next."""
+    yield
+    for context in browser.contexts:
+        await context.close()

@@ -20,40 +20,21 @@ from coordinator.hmi.sessions import Session
 from coordinator.task import Executed, Status
 from coordinator.taskfile import load
 from tests.bench.hmi import SyntheticMission, ticking
-from tests.hmi.conftest import ARGUMENTS, BROWSER, browser_missing, served, staged
+from tests.hmi.conftest import browser_missing, served, staged
 from tests.hmi.stage import Part, Stage
 from tests.hmi.test_changes import changes
 
 if browser_missing() and os.environ.get("CI") != "true":
     pytest.skip(browser_missing(), allow_module_level=True)
 
-from playwright.async_api import Browser, Locator, Route, async_playwright, expect
+from playwright.async_api import Browser, Locator, Route, expect
 from playwright.async_api import Page as Tab
 
-pytestmark = pytest.mark.asyncio(loop_scope="module")
+pytestmark = [pytest.mark.asyncio(loop_scope="module"), pytest.mark.usefixtures("_windows_are_closed")]
 Watch = Callable[[Any], list[str]]
 SIZE = {"width": 1440, "height": 900}
 PATIENCE_MS = 20_000  # a browser beside other tests on two cores is late now and then
 expect.set_options(timeout=PATIENCE_MS)
-
-
-@pytest_asyncio.fixture(scope="module", loop_scope="module")
-async def browser() -> AsyncIterator[Browser]:
-    """Chromium without a window, one for all tests of this file."""
-    if browser_missing():
-        pytest.fail(browser_missing())
-    async with async_playwright() as driver:
-        launched = await driver.chromium.launch(executable_path=str(BROWSER), args=ARGUMENTS)
-        yield launched
-        await launched.close()
-
-
-@pytest_asyncio.fixture(loop_scope="module", autouse=True)
-async def _windows_are_closed(browser: Browser) -> AsyncIterator[None]:
-    """No window of one test goes on painting during the next."""
-    yield
-    for context in browser.contexts:
-        await context.close()
 
 
 @pytest_asyncio.fixture(loop_scope="module")

@@ -18,38 +18,19 @@ from coordinator.hmi.edits import edited, parse, plain
 from coordinator.hmi.server import Page
 from coordinator.taskfile import load
 from tests.drawing.conftest import random_task
-from tests.hmi.conftest import ARGUMENTS, BROWSER, browser_missing, served, staged
+from tests.hmi.conftest import browser_missing, served, staged
 from tests.hmi.stage import Stage
 
 if browser_missing() and os.environ.get("CI") != "true":
     pytest.skip(browser_missing(), allow_module_level=True)
 
-from playwright.async_api import Browser, ConsoleMessage, Locator, async_playwright, expect
+from playwright.async_api import Browser, ConsoleMessage, Locator, expect
 from playwright.async_api import Page as Tab
 
-pytestmark = pytest.mark.asyncio(loop_scope="module")
+pytestmark = [pytest.mark.asyncio(loop_scope="module"), pytest.mark.usefixtures("_windows_are_closed")]
 PATIENCE_MS = 20_000
 DRAWING = "Drawing of the task"
 expect.set_options(timeout=PATIENCE_MS)
-
-
-@pytest_asyncio.fixture(scope="module", loop_scope="module")
-async def browser() -> AsyncIterator[Browser]:
-    """Chromium without a window, one for all tests of this file."""
-    if browser_missing():
-        pytest.fail(browser_missing())
-    async with async_playwright() as driver:
-        launched = await driver.chromium.launch(executable_path=str(BROWSER), args=ARGUMENTS)
-        yield launched
-        await launched.close()
-
-
-@pytest_asyncio.fixture(loop_scope="module", autouse=True)
-async def _windows_are_closed(browser: Browser) -> AsyncIterator[None]:
-    """No window of one test goes on painting during the next."""
-    yield
-    for context in browser.contexts:
-        await context.close()
 
 
 @pytest_asyncio.fixture(loop_scope="module")

@@ -12,13 +12,13 @@ import pytest
 import pytest_asyncio
 
 from coordinator.hmi.server import Page
-from tests.hmi.conftest import ARGUMENTS, BROWSER, browser_missing, served, staged
+from tests.hmi.conftest import browser_missing, served, staged
 from tests.hmi.stage import Stage
 
 if browser_missing() and os.environ.get("CI") != "true":
     pytest.skip(browser_missing(), allow_module_level=True)
 
-from playwright.async_api import Browser, async_playwright, expect
+from playwright.async_api import Browser, expect
 from playwright.async_api import Page as Tab
 
 from tests.hmi.test_browser import PATIENCE_MS, Watch
@@ -29,17 +29,6 @@ OTHER = "Überprüfung_der_Zange_für_日本語_und_العربية"
 MARKUP = "<img src=x onerror=\"document.title='owned'\"><b>bold</b> &amp; &lt;"
 NAMES = (LONG, OTHER, MARKUP)
 SIZES = [(1280, 720, 1, "light"), (1920, 1080, 1, "dark"), (640, 360, 2, "light"), (640, 360, 2, "dark")]
-
-
-@pytest_asyncio.fixture(scope="module", loop_scope="module")
-async def browser() -> AsyncIterator[Browser]:
-    """Chromium without a window."""
-    if browser_missing():
-        pytest.fail(browser_missing())
-    async with async_playwright() as driver:
-        launched = await driver.chromium.launch(executable_path=str(BROWSER), args=ARGUMENTS)
-        yield launched
-        await launched.close()
 
 
 @pytest_asyncio.fixture(loop_scope="module")

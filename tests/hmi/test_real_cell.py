@@ -16,12 +16,12 @@ from pathlib import Path
 import pytest
 import pytest_asyncio
 
-from tests.hmi.conftest import ARGUMENTS, BROWSER, browser_missing
+from tests.hmi.conftest import browser_missing
 
 if browser_missing() and os.environ.get("CI") != "true":
     pytest.skip(browser_missing(), allow_module_level=True)
 
-from playwright.async_api import Browser, async_playwright, expect
+from playwright.async_api import Browser, expect
 from playwright.async_api import Page as Tab
 
 from tests.hmi.test_browser import PATIENCE_MS, SIZE, Watch, draw_the_task, element
@@ -113,17 +113,6 @@ async def served(tmp_path: Path) -> AsyncIterator[Served]:
         yield made
 
 
-@pytest_asyncio.fixture(scope="module", loop_scope="module")
-async def browser() -> AsyncIterator[Browser]:
-    """Chromium without a window."""
-    if browser_missing():
-        pytest.fail(browser_missing())
-    async with async_playwright() as driver:
-        launched = await driver.chromium.launch(executable_path=str(BROWSER), args=ARGUMENTS)
-        yield launched
-        await launched.close()
-
-
 @asynccontextmanager
 async def window(browser: Browser, served: Served, theme: str = "light") -> AsyncIterator[Tab]:
     """A new window on the page, as a new person would open it."""
@@ -199,7 +188,7 @@ async def start_again(tab: Tab, shots: Path) -> None:
     await expect(mission).to_contain_text("Idle")
     await element(tab, "^Transition begin", "Task net").click()
     await tab.get_by_role("button", name="Set breakpoint").click()
-    await toolbar.get_by_role("button", name="Start").click()
+    await toolbar.get_by_role("button", name="Start", exact=True).click()
     await expect(mission).to_contain_text("Paused")
     await toolbar.get_by_role("button", name="Abort").click()
     await toolbar.get_by_role("button", name="Abort the mission?").click()
@@ -224,7 +213,7 @@ async def test_what_cannot_start_says_why_on_the_page(browser: Browser, served: 
         toolbar = tab.get_by_role("toolbar", name="Mission")
         await toolbar.get_by_label("Task to start").select_option("catch_ball")
         await expect(element(tab, "^Action place locate_ball", "Task net")).to_be_visible()
-        await toolbar.get_by_role("button", name="Start").click()
+        await toolbar.get_by_role("button", name="Start", exact=True).click()
         await expect(tab.get_by_text(re.compile("catch_ball may not run.*no node offers")).first).to_be_visible()
         await tab.screenshot(path=shots / "serve-refused.png")
         await tab.get_by_role("tab", name="Design").click()

@@ -14,31 +14,20 @@ from coordinator.hmi.journals import JournalHistory
 from coordinator.hmi.server import Page, start_page
 from coordinator.journal import read_journal
 from coordinator.runfolder import JOURNAL
-from tests.hmi.conftest import ARGUMENTS, BROWSER, browser_missing
+from tests.hmi.conftest import browser_missing
 from tests.station.conftest import TASK
 from tests.station.test_starting import REMARKED, Simulated
 
 if browser_missing() and os.environ.get("CI") != "true":
     pytest.skip(browser_missing(), allow_module_level=True)
 
-from playwright.async_api import Browser, Locator, async_playwright, expect
+from playwright.async_api import Browser, Locator, expect
 from playwright.async_api import Page as Tab
 
 from tests.hmi.test_browser import PATIENCE_MS, Watch, element, opened
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 expect.set_options(timeout=PATIENCE_MS)
-
-
-@pytest_asyncio.fixture(scope="module", loop_scope="module")
-async def browser() -> AsyncIterator[Browser]:
-    """Chromium without a window."""
-    if browser_missing():
-        pytest.fail(browser_missing())
-    async with async_playwright() as driver:
-        launched = await driver.chromium.launch(executable_path=str(BROWSER), args=ARGUMENTS)
-        yield launched
-        await launched.close()
 
 
 @pytest_asyncio.fixture(loop_scope="module")

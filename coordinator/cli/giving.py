@@ -1,0 +1,54 @@
+"""What a run leaves: progress while it goes on, then its result in the terminal, as JSON, beside its journal and as a report."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from coordinator.cli.loading import pictures_of, write_json
+
+if TYPE_CHECKING:
+    from coordinator.mission import Mission
+    from coordinator.task import Task
+    from coordinator.timeline import Timeline
+
+
+@contextmanager
+def progress(options: argparse.Namespace) -> Iterator[Callable[[Mission, float], None] | None]:
+    """Shows how far a run is, unless the terminal is to be quiet or takes the JSON."""
+    if options.quiet or options.json == "-":
+        yield None
+        return
+    from coordinator.cli.progress import live_progress
+
+    with live_progress() as watch:
+        yield watch
+
+
+def give(
+    result: dict[str, Any], task: Task, timeline: Timeline, options: argparse.Namespace, folder: Path | None
+) -> None:
+    """Write the result where it was asked for and beside the journal, print it, leave the report."""
+    if folder is not None:
+        from coordinator.runfolder import RESULT
+
+        write_json(str(folder / RESULT), result)
+    if options.json:
+        write_json(options.json, result)
+    if options.json != "-":
+        from coordinator.cli.progress import print_result
+
+        print_result(result)
+    if options.report is not None:
+        from coordinator.drawing import draw
+        from coordinator.report import report_html
+
+        options.report.mkdir(parents=True, exist_ok=True)
+        write_json(str(options.report / "result.json"), result)
+        page = options.report / "index.html"
+        net = draw(task, error_branches=True)
+        page.write_text(report_html(result, timeline, net, pictures_of(task, result)), encoding="utf-8")
+        print(f"report: {page}")
