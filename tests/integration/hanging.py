@@ -9,14 +9,13 @@ from typing import Any
 
 from services.action import Context, Result, success
 
-FOR_EVER = 1_000_000
 _HOLDING_THE_INTERPRETER = ctypes.PyDLL(None)
 
 
 def hang() -> None:
     """Never come back, and let nobody else run."""
     while True:
-        _HOLDING_THE_INTERPRETER.sleep(FOR_EVER)
+        _HOLDING_THE_INTERPRETER.pause()
 
 
 class Stand:
