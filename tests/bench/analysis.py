@@ -67,8 +67,7 @@ def space_ours(name: str, engine: str) -> dict[str, Any]:
     from coordinator.analysis.space import explore
 
     net = SPACES[name]()
-    if engine == "numba":
-        explore(kanban(1), engine="numba")
+    explore(kanban(1), engine=engine)  # type: ignore[arg-type] # imports and compiles
 
     def work() -> dict[str, Any]:
         space = explore(net, engine=engine)  # type: ignore[arg-type]
