@@ -91,10 +91,66 @@ async def choose(tab: Tab, *names: str) -> None:
         await element(tab, name).click(modifiers=["Shift"] if i else [])
 
 
+async def drag(tab: Tab, name: str, dx: float, dy: float) -> None:
+    """Take an element with the mouse and put it down elsewhere (pixels of the window)."""
+    box = await element(tab, name).bounding_box()
+    assert box is not None
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    await tab.mouse.move(x, y)
+    await tab.mouse.down()
+    await tab.mouse.move(x + dx, y + dy, steps=7)
+    await tab.mouse.up()
+
+
 async def save(tab: Tab) -> None:
     """Save, and wait until the server has it."""
     await tab.keyboard.press("Control+s")
     await expect(tab.locator(".saved")).to_have_text("saved")
+
+
+# ---- arranging --------------------------------------------------------------------------------------------------------
+
+
+async def test_chosen_elements_are_put_in_order(browser: Browser, page: Page, tasks: Path) -> None:
+    """In a row, in a column, spaced evenly, on the grid: as buttons; each is one step of undo."""
+    path = tasks / "pick_and_place.toml"
+    names = ("look", "pick", "put")
+    before = {name: (place.x, place.y) for name, place in load(path).places.items()}
+    tab, complaints = await designing(browser, page)
+    await drag(tab, "^Action place pick", 37, 53)
+    await choose(tab, *(f"^Action place {name}" for name in names))
+
+    async def arranged(button: str) -> list[tuple[float, float]]:
+        await properties(tab).get_by_role("button", name=button).click()
+        await save(tab)
+        return [(place.x or 0.0, place.y or 0.0) for place in map(load(path).places.__getitem__, names)]
+
+    row = await arranged("Align in a row")
+    assert len({y for _, y in row}) == 1 and row[0][1] % 10 == 0
+    evenly = await arranged("Space evenly")
+    xs = sorted(x for x, _ in evenly)
+    assert abs((xs[2] - xs[1]) - (xs[1] - xs[0])) <= 10 and xs[0] != xs[1]
+    column = await arranged("Align in a column")
+    assert len({x for x, _ in column}) == 1
+    for _ in ("column", "evenly", "row", "drag"):
+        await tab.keyboard.press("Control+z")
+    await save(tab)
+    assert {name: (place.x, place.y) for name, place in load(path).places.items()} == before
+    assert not complaints
+
+
+async def test_a_dragged_element_lands_on_the_grid(browser: Browser, page: Page, tasks: Path) -> None:
+    """Whatever the zoom: positions are multiples of ten."""
+    path = tasks / "pick_and_place.toml"
+    tab, complaints = await designing(browser, page)
+    await tab.get_by_role("button", name="Zoom in").click()
+    old = load(path).places["pick"]
+    await drag(tab, "^Action place pick", 37, 53)
+    await save(tab)
+    new = load(path).places["pick"]
+    assert new.x is not None and new.y is not None and (new.x, new.y) != (old.x, old.y)
+    assert new.x % 10 == 0 and new.y % 10 == 0
+    assert not complaints
 
 
 # ---- macro places -----------------------------------------------------------------------------------------------------
