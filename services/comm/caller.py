@@ -106,7 +106,8 @@ class Caller:
         call = m.Call(id, service, arguments, deadline, epoch or self.hello.epoch, boot or self.boot, parent, seed)
         if self.up:
             due = now + self._patience.accept
-            self._pending.begin(Pending(call, not boot, now, waiter, True, False, None, due))
+            self._pending[id] = Pending(call, not boot, now, waiter, True, False, None, due)
+            self._pending.watch_new(due, id)
             self._messages.append(call)
             if due < self.soonest:
                 self.soonest = due

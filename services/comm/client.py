@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, cast
 
 from services.comm.caller import Caller, Notice
-from services.comm.link import READ_BUFFER, Limits, Link, Timing, clock_of
+from services.comm.link import READ_BUFFER, Limits, Link, Timing, clock_of, futures_of
 from services.comm.messages import Bye, Call, Executed, Message, Outcome, Refuse, Welcome
 from services.comm.under_way import NEVER
 from services.comm.wire import ProtocolError, Side, State
@@ -111,6 +111,7 @@ class Client:
         self.buffer = bytearray(READ_BUFFER)
         self._on_notices = on_notices
         self._link: _ClientLink | None = None
+        self._future = futures_of(self._loop)
         self._task: asyncio.Task[None] | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._armed = NEVER
@@ -165,13 +166,16 @@ class Client:
         """Call a service: its outcome, which is acknowledged when it comes. Cancelling the task cancels the call."""
         id_ = f"{self._prefix}{next(_NUMBERS)}"
         now = self.now()
-        future: asyncio.Future[Outcome] = self._loop.create_future()
+        future: asyncio.Future[Outcome] = self._future()
         caller = self.caller
-        waiting = caller.begin(now, id_, service, arguments, deadline, parent, seed, waiter=future)
-        if waiting >= AT_ONCE or (caller.calls == 1 and not self._flushing):
+        waiting = caller.begin(now, id_, service, arguments, deadline, parent, seed, 0, "", future)
+        if waiting >= AT_ONCE:
             self.flush(now)
         elif not self._flushing:
-            self._flush_in_a_moment()
+            if caller.calls == 1:
+                self.flush(now)
+            else:
+                self._flush_in_a_moment()
         try:
             return await future
         except asyncio.CancelledError:

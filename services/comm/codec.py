@@ -49,7 +49,8 @@ LIMITS: Mapping[int, int] = {
 
 MAX_CONTAINERS = 100_000
 """Most arrays and maps in one message: one byte each on the wire, some 70 in memory."""
-_UNCOUNTED = 64 * KIB
+UNCOUNTED = 64 * KIB
+"""Bodies up to so many bytes are read without counting their arrays and maps."""
 _NUMBERS = frozenset((float, int))
 _TICK = Tick.KIND
 _ARRAY, _MESSAGE = 1, 2
@@ -198,7 +199,7 @@ def _reader(names: list[str]) -> Callable[[Any], tuple[Any, ...]]:
 _SPECS: dict[int, _Spec] = {cls.KIND: _Spec(cls) for cls in get_args(Message)}
 _LEAVES: frozenset[type] = frozenset((np.ndarray, *get_args(Message)))
 _pack = msgpack.Packer(buf_size=64 * KIB).pack
-_unpackb = msgpack.unpackb
+unpack = msgpack.unpackb
 
 
 def encode(message: Message) -> bytes:
@@ -218,6 +219,24 @@ def encode(message: Message) -> bytes:
         text = f"a {type(message).__name__} of {len(body)} bytes is above its limit of {LIMITS[kind]}"
         raise ProtocolError("too_large", text)
     return body
+
+
+def encode_all(messages: Iterable[Message]) -> list[bytes]:
+    """`encode` of each, the kinds that make up nearly all traffic without a call of it. Raises as `encode`."""
+    bodies: list[bytes] = []
+    for message in messages:
+        kind = message.KIND
+        writer = WRITERS.get(kind)
+        if writer is not None:
+            try:
+                body = _pack(writer(message))
+                if len(body) <= LIMITS[kind]:
+                    bodies.append(body)
+                    continue
+            except (TypeError, ValueError, OverflowError):
+                pass  # `encode` says what is wrong with it
+        bodies.append(encode(message))
+    return bodies
 
 
 def _tick_out(tick: Any) -> tuple[int, list[Any]]:
@@ -243,7 +262,8 @@ def _extension_in(code: int, data: bytes) -> Any:
     raise _FieldError(f"unknown extension type {code}")
 
 
-def _no_extension(code: int, data: bytes) -> Any:
+def no_extension(code: int, data: bytes) -> Any:
+    """For `unpack`: no extension type may stand outside an envelope of lock step."""
     raise _FieldError(f"unknown extension type {code}")
 
 
@@ -267,23 +287,24 @@ def decode_kind(body: bytes | memoryview, kind: int) -> Message:
     """`decode` of a body whose kind and length have been checked."""
     reader = READERS.get(kind)
     size = len(body)
-    if reader is not None and size <= _UNCOUNTED:
+    if reader is not None and size <= UNCOUNTED:
         try:
-            message = reader(_unpackb(body, ext_hook=_no_extension), size <= NAME_LENGTH)
+            message = reader(unpack(body, ext_hook=no_extension), size <= NAME_LENGTH)
             if message is not None:
                 return message
         except Exception:
             pass  # whatever it is, the table finds and names it
-    return _decode_by_table(body, kind, size)
+    return decode_by_table(body, kind, size)
 
 
-def _decode_by_table(body: bytes | memoryview, kind: int, size: int) -> Message:
+def decode_by_table(body: bytes | memoryview, kind: int, size: int) -> Message:
+    """`decode_kind` of a body of `size` bytes that no reader of `frequent.py` takes."""
     spec = _SPECS[kind]
     index = 2  # the map: all that a reader can find fault with
     try:
         try:
-            if size <= _UNCOUNTED and kind != _TICK:
-                fields = _unpackb(body, ext_hook=_no_extension)
+            if size <= UNCOUNTED and kind != _TICK:
+                fields = unpack(body, ext_hook=no_extension)
             else:
                 fields = list(_unpack_counted(body, kind))
         except Exception as fault:
@@ -324,10 +345,10 @@ def _not_readable(fault: Exception) -> _FieldError:
 
 
 def _unpack_counted(body: bytes | memoryview, kind: int) -> Any:
-    counter = _Counter() if len(body) > _UNCOUNTED else None
+    counter = _Counter() if len(body) > UNCOUNTED else None
     if kind == Tick.KIND:
         return msgpack.unpackb(body, use_list=False, ext_hook=_extension_in, list_hook=counter, object_hook=counter)
-    return msgpack.unpackb(body, ext_hook=_no_extension, list_hook=counter, object_hook=counter)
+    return msgpack.unpackb(body, ext_hook=no_extension, list_hook=counter, object_hook=counter)
 
 
 def _other_types(spec: _Spec, fields: list[Any]) -> None:

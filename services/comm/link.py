@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import secrets
 import socket
 import time
@@ -335,6 +336,12 @@ class Link(asyncio.BufferedProtocol):
 def clock_of(loop: asyncio.AbstractEventLoop) -> Callable[[], float]:
     """The clock of a loop: for asyncio's own the function that its `time` calls."""
     return time.monotonic if type(loop).time is asyncio.BaseEventLoop.time else loop.time
+
+
+def futures_of(loop: asyncio.AbstractEventLoop) -> Callable[[], asyncio.Future[Any]]:
+    """What makes the futures of a loop: for asyncio's own the class that its `create_future` calls."""
+    usual = getattr(type(loop), "create_future", None) is asyncio.BaseEventLoop.create_future
+    return functools.partial(asyncio.Future, loop=loop) if usual else loop.create_future
 
 
 def _host(address: object) -> str:

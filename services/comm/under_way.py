@@ -70,25 +70,22 @@ class UnderWay(dict[str, Pending]):
     def __init__(self) -> None:
         super().__init__()
         self._accepts: deque[tuple[float, str]] = deque()
+        self._most = _SPARE
+        """Watches for ACCEPT above which those of ended calls are looked for."""
         self._results: list[tuple[float, str]] = []
 
-    def begin(self, pending: Pending) -> None:
-        """A call that was sent as it was made: it waits for ACCEPT."""
-        id_ = pending.call.id
-        self[id_] = pending
+    def watch_new(self, due: float, id_: str) -> None:
+        """A call that was sent as it was made, with this `accept_due`, waits for ACCEPT."""
         accepts = self._accepts
-        accepts.append((pending.accept_due, id_))
-        if len(accepts) > 2 * len(self) + _SPARE:
+        accepts.append((due, id_))
+        if len(accepts) > self._most:
+            # Most of them have ended long before their time: a second of quick calls is a hundred thousand of them.
             self._drop_past()
 
     def watch_accept(self, pending: Pending, due: float) -> None:
         """Wait for ACCEPT until `due`."""
         pending.accept_due = due
-        accepts = self._accepts
-        accepts.append((due, pending.call.id))
-        if len(accepts) > 2 * len(self) + _SPARE:
-            # Most of them have ended long before their time: a second of quick calls is a hundred thousand of them.
-            self._drop_past()
+        self.watch_new(due, pending.call.id)
 
     def watch_result(self, pending: Pending, due: float) -> None:
         """Wait for RESULT until `due`, or until an earlier time set before."""
@@ -143,3 +140,4 @@ class UnderWay(dict[str, Pending]):
             if pending is not None and not pending.accepted:
                 break
             accepts.popleft()
+        self._most = 2 * len(self) + _SPARE
