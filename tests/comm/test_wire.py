@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.comm import messages as m
-from services.comm.codec import LIMITS, encode
+from services.comm.codec import LIMITS, decode, encode
 from services.comm.wire import Connection, ProtocolError, Side, State, negotiate
 
 from .conftest import KEY, KINDS, NONCES, greet, messages_of, new_pair
@@ -72,6 +72,43 @@ def test_several_of_which_one_may_not_go_change_nothing(open_pair: Pair, key: by
         with pytest.raises(ProtocolError):
             client.send_all([m.Ping(1), bad])
     assert server.receive_data(client.send_all([m.Ping(2)])) == [m.Ping(2)]
+
+
+def _told(read: Callable[[], m.Message]) -> str:
+    try:
+        return repr(read())
+    except ProtocolError as fault:
+        return str(fault)
+
+
+@given(st.data(), st.booleans())
+def test_an_open_connection_reads_a_body_as_decode_does(data: st.DataObject, sealed: bool) -> None:
+    """Whole frames of the kinds that make up nearly all traffic are read without `decode`."""
+    kind = data.draw(st.sampled_from((m.Call, m.Outcome)))
+    body = bytearray(encode(data.draw(messages_of([kind]))))
+    for place, byte in data.draw(st.lists(st.tuples(st.integers(2, 10_000), st.integers(0, 255)), max_size=2)):
+        body[min(place, len(body) - 1)] = byte
+    _assert_read_alike(kind, bytes(body), KEY if sealed else None)
+
+
+@pytest.mark.parametrize("kind", [m.Call, m.Outcome])
+@pytest.mark.parametrize("length", [200, 239, 240, 255, 256, 300])
+def test_a_long_name_is_measured_on_an_open_connection(kind: type[Any], length: int, key: bytes | None) -> None:
+    _assert_read_alike(kind, encode(kind("x" * length, "y")), key)
+
+
+@pytest.mark.parametrize("empty", [[], {}])
+def test_many_containers_are_counted_on_an_open_connection(empty: Any, key: bytes | None) -> None:
+    for count in (60_000, 70_000, 110_000):
+        _assert_read_alike(m.Call, encode(m.Call("1", "x", {"v": [empty] * count})), key)
+
+
+def _assert_read_alike(kind: type[Any], body: bytes, key: bytes | None) -> None:
+    client, server = new_pair(key)
+    greet(client, server)
+    speaker, listener = (client, server) if kind is m.Call else (server, client)
+    framed = speaker._frame(body)
+    assert _told(lambda: listener.receive_data(framed)[0]) == _told(lambda: decode(body))
 
 
 def test_byte_by_byte_handshake_and_call(key: bytes | None, pair: Pair) -> None:
