@@ -41,8 +41,14 @@ def started(net: Net, folder: Path, *arguments: str) -> subprocess.Popen[str]:
         stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (ROOM, ROOM)),
+        preexec_fn=_limited,
     )
+
+
+def _limited() -> None:
+    """Little memory, and Ctrl-C heard: a shell that runs the tests in the background has its children ignore it."""
+    resource.setrlimit(resource.RLIMIT_AS, (ROOM, ROOM))
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def answered(process: subprocess.Popen[str], *, proven: bool = False) -> dict[str, Any]:
