@@ -53,7 +53,9 @@ class Stopped:
     note: str = ""
     """What else the node says: that the stop is not kept on its disk."""
     latch: str = ""
-    """What was kept on disk in the node's place."""
+    """What was kept or cleared on disk in the node's place."""
+    cleared: bool = False
+    """Whether the stop of a node that does not run was cleared on its disk."""
 
     @property
     def answered(self) -> bool:
@@ -89,6 +91,7 @@ class EmergencyLine:
         self.node = node
         self.why = ""
         self.note = ""
+        self.reached = False
         self._name = name
         self._numbers = 0
         self._answers: dict[str, asyncio.Future[Mapping[str, Any]]] = {}
@@ -99,7 +102,7 @@ class EmergencyLine:
     async def connect(self, timeout: float) -> bool:
         """Whether the node lets us in within so many seconds; `why` says why not."""
         self.client.start()
-        up = await self.client.connected(timeout)
+        up = self.reached = await self.client.connected(timeout)
         if not up and not self.why:
             self.why = f"nobody answers on {self.client.host}:{self.client.port}"
         return up
@@ -161,6 +164,8 @@ async def _order(directory: Directory, credentials: Credentials, node: str, verb
         await asking
         if verb == STOP and not stopped.answered:
             stopped.latch = await _latch(directory, node)
+        if verb == CLEAR and not stopped.answered and not line.reached:
+            stopped.latch, stopped.cleared = await _unlatch(directory, node)
     finally:
         await line.close()
     return stopped
@@ -199,7 +204,26 @@ async def _latch(directory: Directory, node: str) -> str:
         path = await asyncio.to_thread(latch_of(directory.source, node).stop, [ALL])
     except LatchError as fault:
         return f"not latched: {fault}; do not start {node} again before the cell is safe"
-    return f"latched: {path} keeps its devices stopped until it is up and `petrobot estop --clear` is said"
+    return f"latched: {path} keeps its devices stopped until `petrobot estop --clear` is said"
+
+
+async def _unlatch(directory: Directory, node: str) -> tuple[str, bool]:
+    """Clear on disk the stop of a node that does not run; what was done in words, and whether it is cleared."""
+    if node not in await asyncio.to_thread(still_stopped, directory):
+        return "", False
+    devices = [name for name, device in directory.devices.items() if device.node == node]
+    try:
+        await asyncio.to_thread(latch_of(directory.source, node).clear, devices, devices)
+    except LatchError as fault:
+        return f"not cleared: {fault}", False
+    return "it does not run; its stop is cleared on disk, so its devices take orders when it is started", True
+
+
+def still_stopped(directory: Directory) -> list[str]:
+    """The nodes of this host whose devices an emergency stop still holds, as their disks say."""
+    nodes = nodes_with_devices(directory)
+    here = [node for node in nodes if is_local(directory.nodes[node].host)]
+    return [node for node in here if latch_of(directory.source, node).stopped()]
 
 
 async def _stop_buses(directory: Directory, node: str) -> str:

@@ -55,7 +55,7 @@ def run(options: argparse.Namespace) -> int:
     took = time.perf_counter() - begun
     coordinator = asyncio.run(_tell(door, options.journal)) if door is not None and not options.clear else ""
     _show(options, answers, coordinator, took)
-    return 0 if answers and all(answer.answered for answer in answers) else 3
+    return 0 if answers and all(answer.answered or answer.cleared for answer in answers) else 3
 
 
 def _door(options: argparse.Namespace) -> Door | None:
@@ -106,7 +106,7 @@ def _show(options: argparse.Namespace, answers: list[Stopped], coordinator: str,
     for answer in answers:
         for device, said in answer.devices.items():
             print(f"{answer.node:12} {device:12} {said}")
-        if not answer.answered:
+        if not answer.answered and not answer.cleared:
             print(f"{answer.node:12} {'':12} NO ANSWER: {answer.why}")
         for said in filter(None, (answer.note, answer.latch)):
             print(f"{answer.node:12} {'':12} {said}")

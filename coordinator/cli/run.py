@@ -120,6 +120,7 @@ def run(options: argparse.Namespace) -> int:
             with saved(options.learning) as learned:
                 mission, timeline = _run_lockstep(directory, setting, options)
         else:
+            _refuse_stopped(directory)
             options.identity = mission_id(task)
             with saved(options.learning) as learned:
                 mission, timeline = asyncio.run(_run_realtime(directory, setting, options))
@@ -150,6 +151,16 @@ def _refuse_unfit(task: Task, directory: Directory) -> None:
     if faults:
         lines = "\n".join(f"  {f.key}: {f.text}\n    {f.remedy}" for f in faults)
         raise CommandError(2, f"{task.name} may not run:\n{lines}")
+
+
+def _refuse_stopped(directory: Directory) -> None:
+    """A run whose devices obey nobody would end at once, having done nothing."""
+    from coordinator.emergency import still_stopped
+
+    stopped = still_stopped(directory)
+    if stopped:
+        text = f"{', '.join(stopped)}: an emergency stop still holds the devices; once the cell is safe: petrobot estop --clear"
+        raise CommandError(2, text)
 
 
 def _setting(task: Task, directory: Directory, options: argparse.Namespace) -> Setting:

@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 from coordinator.door_file import find_door
+from coordinator.emergency import still_stopped
 from coordinator.launch import local_programs
 from coordinator.runfolder import NoRunError
 from coordinator.supervisor import Supervisor
@@ -32,9 +33,9 @@ RAMP = 1.0
 """Seconds in which a drive's quick stop and its brake are over."""
 
 
-def petrobot(*arguments: str) -> subprocess.Popen[str]:
-    """A command in a process of its own."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+def petrobot(*arguments: str, **variables: str) -> subprocess.Popen[str]:
+    """A command in a process of its own, with these environment variables."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), **variables}
     return subprocess.Popen(
         [sys.executable, "-m", "coordinator", *arguments],
         env=environment,
@@ -72,10 +73,11 @@ class Cell:
         self.coordinator = self.task()
         await self.heard(Ear.moving)
 
-    def task(self) -> subprocess.Popen[str]:
+    def task(self, **variables: str) -> subprocess.Popen[str]:
         """A coordinator that would move the arm."""
         services = ["--services", str(self.directory.source), "--journal", str(self.runs)]
-        return petrobot("run", str(self.folder / "sweeping.toml"), "--runs", "3", *services, "--no-page", "--quiet")
+        task = str(self.folder / "sweeping.toml")
+        return petrobot("run", task, "--runs", "3", *services, "--no-page", "--quiet", **variables)
 
     async def until(self, holds: Callable[[], bool]) -> None:
         """Wait until something holds."""
@@ -182,7 +184,9 @@ async def test_a_stop_outlives_its_node(tmp_path: Path, answers: bool) -> None:
         assert "petrobot estop --clear" in log.read_text(), "whoever starts it sees why nothing moves"
         await cell.heard(without_power)
         cell.ear.forget()
-        code, out, err = await finished(cell.task())
+        code, _, err = await finished(cell.task())
+        assert code == 2 and "petrobot estop --clear" in err, err
+        code, out, err = await finished(cell.task(PETROBOT_STATE=str(tmp_path / "another host")))
         assert code == 1, out + err
         assert without_power(cell.ear) and cell.ear.energised == 0, "not even for a moment"
         assert (await cell.estop("--clear"))[0] == 0
@@ -197,3 +201,15 @@ async def test_estop_without_nodes_says_so(tmp_path: Path) -> None:
     assert code == 3 and "NO ANSWER" in out and "no CAN hub" in out
     with pytest.raises(NoRunError):
         find_door(folder=tmp_path)
+
+
+async def test_a_stop_is_cleared_while_its_node_does_not_run(tmp_path: Path) -> None:
+    """Where the nodes end with the run, nobody could clear it otherwise: exit code 0, and the file is gone."""
+    directory = cell_in(tmp_path)
+    services = ["--services", str(directory.source), "--journal", str(tmp_path)]
+    code, out, _ = await finished(petrobot("estop", *services))
+    assert code == 3 and "latched" in out and still_stopped(directory) == ["motion"]
+    code, out, _ = await finished(petrobot("estop", "--clear", *services))
+    assert code == 0 and "cleared on disk" in out and "NO ANSWER" not in out
+    assert still_stopped(directory) == []
+    assert (await finished(petrobot("estop", "--clear", *services)))[0] == 3, "nobody there, and nothing to clear"
