@@ -8,27 +8,18 @@ line. While the net is paused and every node has answered, simulated time stands
 from __future__ import annotations
 
 import asyncio
-import json
 import shutil
 import time
-from collections.abc import Callable, Collection, Mapping
-from contextlib import nullcontext
-from typing import Any
 
-from coordinator.controls import Answer, Controls
 from coordinator.departure import Departure
-from coordinator.door_file import Door, door_open
-from coordinator.engine import Mode, Override, SetBreakpoints, Stimulus
+from coordinator.engine import Mode
 from coordinator.hmi.feed import Feed
 from coordinator.launch import Setting, Substitutes, lockstep_cell
 from coordinator.learning_session import LearningSession
+from coordinator.led_run import LedRun
 from coordinator.lockstep_party import CoordinatorParty
-from coordinator.mission import MissionError
-from coordinator.operation import Operation
 from coordinator.partners import FirstAlternative
 from coordinator.recording import JournalStore
-from coordinator.runfolder import RESULT
-from coordinator.start_order import learned_of
 from services.comm.cell import Cell
 from services.comm.directory import Directory
 
@@ -103,8 +94,10 @@ class SimulatedShell:
         return max(0.0, self.now() / self._pace - (time.perf_counter() - begun))
 
 
-class SimulatedRun:
+class SimulatedRun(LedRun):
     """Prepare, lead, finish. Fits `coordinator.station.Run`."""
+
+    mode = "lockstep"
 
     def __init__(
         self,
@@ -117,70 +110,23 @@ class SimulatedRun:
         departs: Departure | None = None,
     ) -> None:
         """Loads the laboratory: takes a while, and needs no loop. Raises what its rooms raise."""
-        self.folder = store.writer.path.parent
-        self.identity = self.folder.name
-        self._setting = setting
-        self._store = store
-        self._pace = pace
-        self._learning = learning
+        folder, selector = store.writer.path.parent, setting.selector
+        assert isinstance(selector, FirstAlternative)
         try:
-            self._cell, self._party = lockstep_cell(directory, setting, substitutes, None, store)
+            cell, party = lockstep_cell(directory, setting, substitutes, None, store)
         except BaseException:
             store.writer.close()
-            shutil.rmtree(self.folder)
+            shutil.rmtree(folder)
             raise
+        self._shell = SimulatedShell(cell, party, pace)
         self._told = {} if departs is None else {"from": {"run": departs.run, "record": departs.record}}
-        self._operation: Operation | None = None
-        self._door: Door | None = None
+        super().__init__(folder, self._shell, selector, store, learning)
 
-    def lead(
-        self,
-        feed: Feed,
-        controls: Controls,
-        door: Callable[[str], Door] | None,
-        stops: Collection[str] = (),
-        choices: Mapping[str, str] | None = None,
-    ) -> None:
-        """Tell it on a feed and let the holder of the controls steer it; `stops` and `choices` hold from the beginning."""
-        shell = SimulatedShell(self._cell, self._party, self._pace)
-        selector = self._setting.selector
-        assert isinstance(selector, FirstAlternative)
-        self._operation = Operation(shell, selector, feed, controls, starts=True, mode="lockstep")
-        self._door = door(self.identity) if door is not None else None
-        first: list[Stimulus] = [SetBreakpoints(tuple(sorted(stops)))] if stops else []
-        first += [Override(primitive, action) for primitive, action in (choices or {}).items()]
+    async def _go(self, feed: Feed) -> None:
         feed.emit("mission", mission={"id": self.identity, **self._told})
-        if first:
-            shell.mission.executor.stimulate(0.0, *first)
+        if self._first:
+            self._shell.mission.executor.stimulate(0.0, *self._first)
+        await self._shell.run(feed)
 
-    async def command(self, who: str, verb: str, data: Mapping[str, Any]) -> Answer:
-        """Carry out an operator's command."""
-        assert self._operation is not None
-        return await self._operation.command(who, verb, data)
-
-    def abort(self, reason: str) -> None:
-        """Give it up, whoever holds the controls."""
-        assert self._operation is not None
-        self._operation.abort(reason)
-
-    async def finish(self) -> None:
-        """Run it to its end; its result is left beside its journal and told, and what was learned is saved."""
-        assert self._operation is not None
-        shell, feed, begun = self._operation.shell, self._operation.feed, time.perf_counter()
-        assert isinstance(shell, SimulatedShell)
-        whole = False
-        try:
-            with door_open(self.folder, self._door) if self._door is not None else nullcontext():
-                await shell.run(feed)
-            whole = True
-        except MissionError as fault:
-            feed.emit("mission", mission={"state": "error", "reason": str(fault)})
-            feed.emit("notice", notice={"level": "error", "text": str(fault), "at": feed.state["time"]})
-        finally:
-            await self._operation.close()
-            self._store.writer.close()
-            learned = {} if self._learning is None else learned_of(self._learning, interrupted=not whole)
-        result = {**shell.mission.result("lockstep", time.perf_counter() - begun), **learned}
-        text = json.dumps(result, indent=2, ensure_ascii=False) + "\n"
-        await asyncio.to_thread((self.folder / RESULT).write_text, text, encoding="utf-8")
-        feed.emit("result", result=result)
+    async def _close(self) -> None:
+        """A cell in this process holds no connection."""
