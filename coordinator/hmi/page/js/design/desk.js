@@ -8,7 +8,7 @@ import { emptyDocument } from "./model.js";
 
 export class Desk {
   constructor(designer) {
-    Object.assign(this, { designer, documents: 0, isShipped: false });
+    Object.assign(this, { designer, documents: 0, isShipped: false, last: Promise.resolve() });
     this.file = h("input", { type: "file", accept: ".pnml,.xml,.toml", hidden: true, "aria-label": "File to import", onchange: () => this.importFile() });
   }
 
@@ -89,10 +89,14 @@ export class Desk {
     });
   }
 
-  /** Save one after the other: a second press while the first is on its way waits for it. */
+  /** One after the other: what is asked for while a save or an import is on its way means what will lie on the desk then. */
+  inTurn(step) {
+    this.last = this.last.then(step, step);
+    return this.last;
+  }
+
   save() {
-    this.saving = (this.saving ?? Promise.resolve()).then(() => this.saveNow(), () => this.saveNow());
-    return this.saving;
+    return this.inTurn(() => this.saveNow());
   }
 
   async saveNow() {
@@ -126,15 +130,24 @@ export class Desk {
 
   async exchange(form) {
     if (form === "in") this.file.click();
-    else if (form) await exportAs(form, this.model, this.designer.view, this.designer.findings.text);
+    else if (form) await this.inTurn(() => exportAs(form, this.model, this.designer.view, this.designer.findings.text));
   }
 
   async importFile() {
     const [file] = this.file.files;
     this.file.value = "";
-    if (!file || !(await this.mayLeave())) return;
+    if (file) await this.inTurn(() => this.importNow(file));
+  }
+
+  async importNow(file) {
+    if (!(await this.mayLeave())) return;
+    const asked = ++this.documents;
     const made = await importNet(file.name.endsWith(".toml") ? "toml" : "pnml", await file.text());
-    if (!made) return;
+    if (asked !== this.documents) return; // another document was asked for meanwhile
+    if (!made) {
+      this.designer.bar.paint();
+      return;
+    }
     this.put({ name: "", revision: null, document: made.document });
     await this.refresh();
     this.designer.view.fit();
