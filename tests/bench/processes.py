@@ -22,6 +22,13 @@ def pin(core: int) -> bool:
     return True
 
 
+def unpin() -> None:
+    """Back among ordinary processes, on all cores, as anybody's process is run."""
+    if hasattr(os, "sched_setscheduler"):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        os.sched_setaffinity(0, range(os.cpu_count() or 1))
+
+
 def start(script: str, *arguments: str, pinned: bool) -> subprocess.Popen[str]:
     """A script of the benchmark again, in another part; its output is a pipe."""
     command = [sys.executable, script, *arguments, "--pin" if pinned else "--no-pin"]

@@ -3,9 +3,9 @@
     python tests/bench/wire.py                       # all that is installed
     python tests/bench/wire.py --quick --json out.json
 
-Contenders take turns every few calls, so that a busy machine is busy for all. Each server is a process of its own; with
-`--pin` (the default where it is permitted) both ends are SCHED_FIFO on different cores. Ratios are what counts:
-microseconds are this machine's.
+Contenders take turns every few calls, so that a busy machine is busy for all. Each server is a process of its own. All is
+measured twice: with both ends SCHED_FIFO on different cores (where that is permitted), which shows the code's own cost, and
+as anybody's processes are scheduled. Ratios are what counts: microseconds are this machine's.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from tests.bench.processes import load, pin, quantile, show, start
+from tests.bench.processes import load, pin, quantile, show, start, unpin
 from tests.bench.wire_contenders import Bare, Contender, Petrobot, PetrobotSealed
 from tests.bench.wire_peers import CONTENDERS
 from tests.bench.wire_streams import measure_streams
@@ -40,6 +40,8 @@ TURN = 20
 NOISE = 1.15
 """Ratios nearer to 1 than this say nothing on a machine that does other things too."""
 PEERS = ("Pyro5", "RPyC", "pyzmq", "grpc.aio")
+PINNED, ORDINARY = "a core each end", "ordinary processes"
+"""How the two ends are scheduled."""
 
 
 class Table:
@@ -108,52 +110,78 @@ class Table:
         return [own / its for own, its in zip(self.rows[name][what], self.rows[to][what], strict=True)]
 
 
-def verdicts(table: Table, streams: dict[str, dict[str, float]]) -> dict[str, tuple[list[float], float, bool]]:
-    """The goals: what the rounds gave, the limit, and whether their median keeps to it."""
+Goals = dict[str, tuple[list[float], float, bool]]
+"""By goal: what the rounds gave, the limit, and whether their median keeps to it."""
+
+
+def call_goals(table: Table) -> Goals:
+    """The goals of calls."""
     ours, sealed, bare = Petrobot.name, PetrobotSealed.name, Bare.name
-    wanted: list[tuple[str, list[float], float, bool]] = []
+    goals: Goals = {}
     for what, column in (("calls in a row", "round p50"), ("spaced calls", "spaced p50")):
-        wanted.append((f"p50 <= 1.6 x bare echo, {what}", table.ratios(ours, bare, column), 1.6, True))
-        wanted.append((f"p50 <= 2.0 x bare echo with MAC, {what}", table.ratios(sealed, bare, column), 2.0, True))
+        goals[f"p50 <= 1.6 x bare echo, {what}"] = _below(table.ratios(ours, bare, column), 1.6)
+        goals[f"p50 <= 2.0 x bare echo with MAC, {what}"] = _below(table.ratios(sealed, bare, column), 2.0)
         for peer in PEERS:
             if peer in table.rows:
-                wanted.append((f"p50 not above {peer}'s, {what}", table.ratios(ours, peer, column), NOISE, True))
+                goals[f"p50 not above {peer}'s, {what}"] = _below(table.ratios(ours, peer, column), NOISE)
     for peer in ("Pyro5", "RPyC"):
         if peer in table.rows:
-            wanted.append((f"calls/s >= 3 x {peer}'s", table.ratios(ours, peer, "rate"), 3.0, False))
-    for name, row in streams.items():
-        if name.startswith("petrobot"):
-            wanted.append((f"p99 <= 2 x raw, {name}", [row["p99_to_raw"], row["round_p99_to_raw"]], 2.0, True))
+            rates = table.ratios(ours, peer, "rate")
+            goals[f"calls/s >= 3 x {peer}'s"] = rates, 3.0, quantile(rates, 0.5) >= 3.0
+    return goals
+
+
+def stream_goals(streams: dict[str, dict[str, float]]) -> Goals:
+    """The goals of set-point streams."""
     return {
-        goal: (found, limit, quantile(found, 0.5) <= limit if below else quantile(found, 0.5) >= limit)
-        for goal, found, limit, below in wanted
+        f"p99 <= 2 x raw, {name}": _below([row["p99_to_raw"], row["round_p99_to_raw"]], 2.0)
+        for name, row in streams.items()
+        if name.startswith("petrobot")
     }
 
 
-def run(arguments: argparse.Namespace) -> dict[str, Any]:
-    """All measurements."""
-    installed = [one for one in CONTENDERS if not one.needs or importlib.util.find_spec(one.needs) is not None]
-    missing = [one.name for one in CONTENDERS if one not in installed]
-    pinned = arguments.pin and pin(0)
-    where: dict[str, Any] = {"python": platform.python_version(), "cores": os.cpu_count(), "load_before": load()}
-    table = Table(installed, pinned)
+def _below(found: list[float], limit: float) -> tuple[list[float], float, bool]:
+    return found, limit, quantile(found, 0.5) <= limit
+
+
+def scheduled(pinned: bool, arguments: argparse.Namespace) -> dict[str, Any]:
+    """All measurements with one way of scheduling."""
+    table = Table([one for one in CONTENDERS if _is_installed(one)], pinned)
     try:
         table.measure(arguments.rounds, arguments.calls)
     finally:
         table.close()
     calls = table.results()
     streams = measure_streams(max(arguments.rounds // 3, 1), arguments.seconds, pinned)
-    where |= {"load_after": load(), "pinned": pinned, "missing": missing}
+    goals = call_goals(table) | stream_goals(streams)
+    print(f"\n== {PINNED if pinned else ORDINARY} ==")
     show("calls", calls)
     show("streams (age when taken)", streams)
-    goals = verdicts(table, streams)
     print(f"\n{'goal (median, least and largest of the rounds)':52}{'limit':>7}{'median':>8}{'least':>8}{'largest':>8}")
     for goal, (found, limit, met) in goals.items():
         row = "".join(f"{one:8.2f}" for one in (quantile(found, 0.5), min(found), max(found)))
         print(f"{goal:52}{limit:7.2f}{row}  {'met' if met else 'NOT MET'}")
-    print(f"two cores, a process each end, ahead of others: {pinned}; not installed: {', '.join(missing) or 'none'}")
+    return {"calls": calls, "streams": streams, "goals": goals}
+
+
+def _is_installed(one: type[Contender]) -> bool:
+    return not one.needs or importlib.util.find_spec(one.needs) is not None
+
+
+def run(arguments: argparse.Namespace) -> dict[str, Any]:
+    """All measurements, in both ways of scheduling where the first is permitted."""
+    missing = [one.name for one in CONTENDERS if not _is_installed(one)]
+    where: dict[str, Any] = {"python": platform.python_version(), "cores": os.cpu_count(), "load_before": load()}
+    where["missing"] = missing
+    results: dict[str, Any] = {"where": where}
+    if arguments.pin and pin(0):
+        results[PINNED] = scheduled(True, arguments)
+        unpin()
+    results[ORDINARY] = scheduled(False, arguments)
+    where["load_after"] = load()
+    print(f"\nnot installed: {', '.join(missing) or 'none'}")
     print(f"load of this machine before: {where['load_before']}; after: {where['load_after']}")
-    return {"where": where, "calls": calls, "streams": streams, "goals": goals}
+    return results
 
 
 def main() -> None:
@@ -165,7 +193,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="3 rounds of 500 calls, streams of 1 s")
     parser.add_argument("--json", metavar="FILE", help="write the results")
     parser.add_argument(
-        "--pin", action=argparse.BooleanOptionalAction, default=True, help="SCHED_FIFO, a core each end"
+        "--pin", action=argparse.BooleanOptionalAction, default=True, help="measure with SCHED_FIFO, too"
     )
     parser.add_argument("--serve", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
