@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from coordinator.engine import Engine, Point
-from coordinator.executor import Executor
-from coordinator.journal import Journal, JournalWriter
-from coordinator.lockstep_party import NAME, CoordinatorParty
-from coordinator.mission import Mission
-from coordinator.partners import FirstAlternative, Forgetful, Observer, Selector, Store
-from coordinator.recording import EPOCH, JournalStore, last_epoch, origin_of, replay, stages
+from coordinator.mission.executor import Executor
+from coordinator.mission.lockstep_party import NAME, CoordinatorParty
+from coordinator.mission.mission import Mission
+from coordinator.mission.partners import FirstAlternative, Forgetful, Observer, Selector, Store
+from coordinator.record.journal import Journal, JournalWriter
+from coordinator.record.recording import EPOCH, JournalStore, last_epoch, origin_of, replay, stages
 from coordinator.supervisor import Program, is_local
 from coordinator.task import Task
 from services.comm.caller import Caller

@@ -31,6 +31,34 @@ ALLOWED: tuple[tuple[str, tuple[str, ...]], ...] = (
     ),
     ("coordinator.learning", ("coordinator.net", "coordinator.task")),
     ("coordinator.engine", ("coordinator.net", "coordinator.task", "coordinator.conditions")),
+    (
+        "coordinator.record",
+        ("coordinator.net", "coordinator.task", "coordinator.conditions", "coordinator.engine", "services.comm"),
+    ),
+    (
+        "coordinator.mission",
+        (
+            "coordinator.net",
+            "coordinator.task",
+            "coordinator.conditions",
+            "coordinator.engine",
+            "coordinator.record",
+            "services.comm",
+        ),
+    ),
+    (
+        "coordinator.experience",
+        (
+            "coordinator.net",
+            "coordinator.task",
+            "coordinator.conditions",
+            "coordinator.engine",
+            "coordinator.learning",
+            "coordinator.analysis",
+            "coordinator.mission.partners",
+            "services.comm",
+        ),
+    ),
     ("coordinator.hmi", ("coordinator", "services.comm")),
     ("coordinator", ("coordinator", "services.comm")),
 )

@@ -15,8 +15,8 @@ from coordinator.campaign.plan import Block, CampaignError, Plan, digest
 from coordinator.campaign.throws import CostOf, ThrowLog
 from coordinator.engine.instructions import RunRecorded
 from coordinator.launch import SCRIPTED, Setting, load_object, lockstep_mission, lockstep_party
-from coordinator.lockstep_party import CoordinatorParty
-from coordinator.mission import Mission, MissionError
+from coordinator.mission.lockstep_party import CoordinatorParty
+from coordinator.mission.mission import Mission, MissionError
 from coordinator.task import Task
 from coordinator.taskfile import TaskFileError
 from coordinator.taskfile import load as load_task

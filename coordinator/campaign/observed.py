@@ -8,7 +8,7 @@ from typing import Any
 
 from coordinator.campaign.rows import Row
 from coordinator.campaign.throws import RunEntry
-from coordinator.estimates_file import EstimatesFile
+from coordinator.experience.estimates_file import EstimatesFile
 from coordinator.learning.estimate import Key, Observation, Tally
 from coordinator.learning.learning import Estimates
 from coordinator.learning.passage import Flow, PassageKey

@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _missing(task: Task, services: Path | None) -> list[str]:
     """What the task needs and the nodes do not give now: a line for each node that is away or offers less than it should."""
-    from coordinator.asking import ask_all
+    from coordinator.mission.asking import ask_all
 
     directory = load_directory(services)
     used = {a for p in task.flat.places.values() if p.task for a in task.primitive_task_of(p.name).alternatives}

@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from coordinator.cli.replaying import Recorded
-    from coordinator.departure import Departure
     from coordinator.launch import Setting
-    from coordinator.recording import JournalStore
+    from coordinator.operator.departure import Departure
+    from coordinator.record.recording import JournalStore
 
 REFUSED = {
     "task": "the task comes from the run",
@@ -52,8 +52,8 @@ def depart(options: argparse.Namespace) -> int:
     """Simulate from the point; the exit code says whether the task reached its end."""
     from coordinator.cli.giving import give, progress
     from coordinator.cli.lockstep import in_one_process, substitutes
-    from coordinator.journal import JournalError
-    from coordinator.mission import MissionError
+    from coordinator.mission.mission import MissionError
+    from coordinator.record.journal import JournalError
 
     found, departure = _found(options)
     setting = _setting(found, departure, options)
@@ -75,9 +75,9 @@ def depart(options: argparse.Namespace) -> int:
 
 def _found(options: argparse.Namespace) -> tuple[Recorded, Departure]:
     from coordinator.cli.replaying import recorded
-    from coordinator.departure import DepartureError, departure
-    from coordinator.journal import JournalError
-    from coordinator.recording import ReplayError
+    from coordinator.operator.departure import DepartureError, departure
+    from coordinator.record.journal import JournalError
+    from coordinator.record.recording import ReplayError
 
     for name, why in REFUSED.items():
         if getattr(options, name):
@@ -103,7 +103,7 @@ def _named(text: str) -> tuple[str, int]:
 
 
 def _going(texts: list[str]) -> dict[str, str] | str:
-    from coordinator.departure import AGAIN
+    from coordinator.operator.departure import AGAIN
 
     if any("=" not in text for text in texts):
         if len(texts) > 1:
@@ -113,7 +113,7 @@ def _going(texts: list[str]) -> dict[str, str] | str:
 
 
 def _setting(found: Recorded, departure: Departure, options: argparse.Namespace) -> Setting:
-    from coordinator.departure import departing
+    from coordinator.operator.departure import departing
 
     given = dict(pairs("--set", options.set))
     if options.regime is not None:
@@ -134,9 +134,9 @@ def _mock(found: Recorded, options: argparse.Namespace) -> Path | None:
 
 
 def _store(found: Recorded, setting: Setting, departure: Departure, options: argparse.Namespace) -> JournalStore:
-    from coordinator.departure import departed_store
     from coordinator.launch import mission_id
-    from coordinator.runfolder import DEFAULT
+    from coordinator.operator.departure import departed_store
+    from coordinator.record.runfolder import DEFAULT
 
     options.folder = (options.journal or DEFAULT) / mission_id(found.task)
     more: dict[str, Any] = {"durable": options.durable}

@@ -13,8 +13,8 @@ from coordinator.cli import CommandError
 from coordinator.cli.loading import add_services_argument, load_directory, write_json
 
 if TYPE_CHECKING:
-    from coordinator.door_file import Door
-    from coordinator.emergency import Stopped
+    from coordinator.operator.door_file import Door
+    from coordinator.operator.emergency import Stopped
 
 EXAMPLE = "petrobot estop"
 COORDINATOR_PATIENCE = 1.0
@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Stop, or clear; 0 when every node with devices has answered, 3 otherwise."""
-    from coordinator.emergency import CLEAR, STOP, order_all
+    from coordinator.operator.emergency import CLEAR, STOP, order_all
     from services.comm.credentials import COORDINATOR, credentials
 
     door = _door(options)
@@ -60,8 +60,8 @@ def run(options: argparse.Namespace) -> int:
 
 def _door(options: argparse.Namespace) -> Door | None:
     """The run that goes on, if one does: it says which cell is meant, and its coordinator is told."""
-    from coordinator.door_file import find_door
-    from coordinator.runfolder import NoRunError
+    from coordinator.operator.door_file import find_door
+    from coordinator.record.runfolder import NoRunError
 
     try:
         return find_door(options.run, options.journal)
@@ -86,8 +86,8 @@ async def _tell(door: Door, folder: Path) -> str:
 
 def _goes_on(door: Door, folder: Path) -> bool:
     """Whether the run's door is still there: a run whose devices stop may end by itself."""
-    from coordinator.door_file import find_door
-    from coordinator.runfolder import NoRunError
+    from coordinator.operator.door_file import find_door
+    from coordinator.record.runfolder import NoRunError
 
     try:
         return find_door(door.run, folder) == door

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 from coordinator.cli.loading import pictures_of, write_json
 
 if TYPE_CHECKING:
-    from coordinator.mission import Mission
+    from coordinator.mission.mission import Mission
+    from coordinator.record.timeline import Timeline
     from coordinator.task import Task
-    from coordinator.timeline import Timeline
 
 
 @contextmanager
@@ -33,7 +33,7 @@ def give(
 ) -> None:
     """Write the result where it was asked for and beside the journal, print it, leave the report."""
     if folder is not None:
-        from coordinator.runfolder import RESULT
+        from coordinator.record.runfolder import RESULT
 
         write_json(str(folder / RESULT), result)
     if options.json:

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from coordinator.launch import Setting
-    from coordinator.recording import JournalStore
+    from coordinator.record.recording import JournalStore
     from services.comm.directory import Directory
 
 
@@ -45,7 +45,7 @@ def _count(text: str) -> int:
 
 def journal_folder(options: argparse.Namespace) -> Path | None:
     """Where this run is to be kept, None if nowhere."""
-    from coordinator.runfolder import DEFAULT
+    from coordinator.record.runfolder import DEFAULT
 
     return options.journal if options.journal is not None or options.mode == "lockstep" else DEFAULT
 
@@ -61,10 +61,10 @@ def new_store(
 ) -> JournalStore:
     """The journal of a run that begins, in a folder of its own; `more` goes into its header."""
     from coordinator.cli.loading import task_path
-    from coordinator.journal import JournalWriter
     from coordinator.launch import with_runs
-    from coordinator.recording import JournalStore, clock_reading
-    from coordinator.runfolder import JOURNAL, header
+    from coordinator.record.journal import JournalWriter
+    from coordinator.record.recording import JournalStore, clock_reading
+    from coordinator.record.runfolder import JOURNAL, header
 
     services = directory.source.read_text(encoding="utf-8")
     given: Mapping[str, Any] = {
@@ -84,7 +84,7 @@ def new_store(
 def tidy(options: argparse.Namespace) -> None:
     """Remove what `--keep` says is too old; a run without a result is never removed."""
     if options.keep is not None and options.folder is not None:
-        from coordinator.runfolder import retain
+        from coordinator.record.runfolder import retain
 
         for name in retain(options.folder.parent, options.keep):
             print(f"removed the run {name} (--keep {options.keep})", file=sys.stderr)

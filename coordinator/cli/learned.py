@@ -12,7 +12,7 @@ from coordinator.cli.loading import write_json
 from coordinator.cli.propagated import show_task
 
 if TYPE_CHECKING:
-    from coordinator.estimates_file import EstimatesFile, Kept
+    from coordinator.experience.estimates_file import EstimatesFile, Kept
     from coordinator.learning.objective import Comparison, Figures
 
 EXAMPLE = "petrobot learned show learned.db --target 0.95\n  petrobot learned merge learned.db other_machine.db"
@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Do it."""
-    from coordinator.estimates_file import EstimatesError, EstimatesFile
+    from coordinator.experience.estimates_file import EstimatesError, EstimatesFile
 
     file = EstimatesFile(options.file)
     try:

@@ -12,8 +12,8 @@ from coordinator.cli import CommandError
 if TYPE_CHECKING:
     import argparse
 
-    from coordinator.learning_session import LearningSession
-    from coordinator.partners import FirstAlternative
+    from coordinator.experience.learning_session import LearningSession
+    from coordinator.mission.partners import FirstAlternative
     from coordinator.task import Task
     from services.comm.directory import Directory
 
@@ -74,9 +74,9 @@ def opened(
             if getattr(options, name):
                 raise CommandError(2, f"--{name} needs --learn FILE: without it nothing is learned or read")
         return None
-    from coordinator.estimates_file import EstimatesError
+    from coordinator.experience.estimates_file import EstimatesError
+    from coordinator.experience.learning_session import LearningSession, LearningSetting
     from coordinator.learning.selectors import DEFAULT
-    from coordinator.learning_session import LearningSession, LearningSetting
 
     contexts = None if options.context is None else tuple(part for part in options.context if part)
     declared = {a.name: a.compute_time for a in directory.actions.values()} if options.mode == "lockstep" else None
@@ -104,7 +104,7 @@ def saved(session: LearningSession | None) -> Iterator[dict[str, Any]]:
 
 
 def _save(session: LearningSession, *, interrupted: bool) -> dict[str, Any]:
-    from coordinator.estimates_file import EstimatesError
+    from coordinator.experience.estimates_file import EstimatesError
 
     try:
         runs = session.save(interrupted=interrupted)
@@ -125,9 +125,9 @@ def _save(session: LearningSession, *, interrupted: bool) -> dict[str, Any]:
 
 def resumed_selector(task: Task, header: Mapping[str, Any]) -> tuple[FirstAlternative, LearningSession | None]:
     """Who chose in a recorded run, as at its beginning."""
-    from coordinator.estimates_file import EstimatesError
-    from coordinator.learning_session import fixed_by_user, session_of
-    from coordinator.partners import FirstAlternative
+    from coordinator.experience.estimates_file import EstimatesError
+    from coordinator.experience.learning_session import fixed_by_user, session_of
+    from coordinator.mission.partners import FirstAlternative
 
     try:
         session = session_of(task, header)

@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
     from coordinator.cli.replaying import Recorded
     from coordinator.launch import Setting
-    from coordinator.mission import Mission
-    from coordinator.partners import Observer, Selector, Store
-    from coordinator.timeline import Timeline
+    from coordinator.mission.mission import Mission
+    from coordinator.mission.partners import Observer, Selector, Store
+    from coordinator.record.timeline import Timeline
     from services.comm.directory import Directory
 
 LONGEST = 10**9
@@ -77,10 +77,10 @@ def in_one_process(
 def retrace(found: Recorded, selector: Selector, watch: Watch | None) -> tuple[Mission, Timeline]:
     """Go on with a run whose cell ended with its coordinator: made again from its seed, compared with the journal as far as that
     goes, and written on from there."""
-    from coordinator.departure import departed
-    from coordinator.journal import JournalWriter
     from coordinator.launch import Setting
-    from coordinator.recording import RetracingStore
+    from coordinator.operator.departure import departed
+    from coordinator.record.journal import JournalWriter
+    from coordinator.record.recording import RetracingStore
 
     header = found.journal.header
     store = RetracingStore(JournalWriter(found.journal.path), found.journal)
@@ -95,7 +95,7 @@ def rejoin(
 ) -> tuple[Mission, Timeline]:
     """Go on with a run whose nodes wait for their coordinator."""
     from coordinator.launch import lockstep_member, resumed_mission
-    from coordinator.timeline import Timeline
+    from coordinator.record.timeline import Timeline
 
     timeline = Timeline()
     seen = [timeline, *observers]
@@ -124,7 +124,7 @@ def substitutes(mock: Path | None, directory: Directory) -> Mapping[str, Callabl
 
 
 def _timed(mission: Mission) -> Timeline:
-    from coordinator.timeline import Timeline
+    from coordinator.record.timeline import Timeline
 
     timeline = Timeline()
     mission.executor.observers.append(timeline)

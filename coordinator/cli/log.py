@@ -22,8 +22,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Print or export."""
-    from coordinator.journal import JournalError
-    from coordinator.recording import ReplayError
+    from coordinator.record.journal import JournalError
+    from coordinator.record.recording import ReplayError
 
     found = recorded(options.run)
     try:
@@ -41,7 +41,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _write_mcap(path: Path, found: Recorded) -> None:
-    from coordinator.mcap_export import McapMissingError, write_mcap
+    from coordinator.record.mcap_export import McapMissingError, write_mcap
 
     try:
         count = write_mcap(path, found.journal, found.engine.compiled.net, found.steps())
@@ -51,7 +51,7 @@ def _write_mcap(path: Path, found: Recorded) -> None:
 
 
 def _exported(form: str, found: Recorded) -> Iterator[str]:
-    from coordinator.export import jsonl, xes
+    from coordinator.record.export import jsonl, xes
 
     return (jsonl if form == "jsonl" else xes)(found.journal, found.steps())
 

@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Ask; 0 when all are up, 3 otherwise."""
-    from coordinator.asking import ask_all
+    from coordinator.mission.asking import ask_all
 
     answers = asyncio.run(ask_all(load_directory(options.services), options.timeout))
     if options.json:

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 if TYPE_CHECKING:
-    from coordinator.mission import Mission
+    from coordinator.mission.mission import Mission
 
 COLOURS = {"success": "green", "failure": "yellow", "error": "red"}
 REFRESH = 0.1

@@ -10,7 +10,7 @@ from coordinator.cli import CommandError
 from coordinator.cli.loading import load_task, write_json
 
 if TYPE_CHECKING:
-    from coordinator.estimates_file import Kept
+    from coordinator.experience.estimates_file import Kept
 
 
 def show_task(kept: Kept, options: argparse.Namespace) -> int:
@@ -28,8 +28,8 @@ def show_task(kept: Kept, options: argparse.Namespace) -> int:
 def figures(kept: Kept, name: str, context: str | None) -> dict[str, Any]:
     """Plain data: the parts, and the whole for one token in the runs place."""
     from coordinator.analysis.stochastic import NoEstimate
+    from coordinator.experience.propagation import propagate
     from coordinator.launch import with_runs
-    from coordinator.propagation import propagate
 
     task, _ = with_runs(load_task(name), 1)
     try:

@@ -19,8 +19,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Replay; 0 when all is the same, 1 at a difference."""
-    from coordinator.journal import JournalError
-    from coordinator.recording import ReplayError
+    from coordinator.record.journal import JournalError
+    from coordinator.record.recording import ReplayError
 
     found = recorded(options.run)
     count, firings = 0, 0

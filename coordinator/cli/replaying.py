@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from coordinator.engine import Engine
-    from coordinator.journal import Journal
-    from coordinator.recording import Step
+    from coordinator.record.journal import Journal
+    from coordinator.record.recording import Step
     from coordinator.task import Task
     from services.comm.directory import Directory
 
@@ -33,7 +33,7 @@ class Recorded:
 
     def steps(self) -> Iterator[Step]:
         """Every stimulus derived again."""
-        from coordinator.recording import replay
+        from coordinator.record.recording import replay
 
         return replay(self.journal, self.engine)
 
@@ -41,9 +41,9 @@ class Recorded:
 def recorded(name: str) -> Recorded:
     """Read a run's journal and build its task, directory and engine from the texts in its header."""
     from coordinator.engine import Engine
-    from coordinator.journal import JournalError, read_journal
     from coordinator.launch import with_runs
-    from coordinator.runfolder import NoRunError, journal_of
+    from coordinator.record.journal import JournalError, read_journal
+    from coordinator.record.runfolder import NoRunError, journal_of
     from coordinator.taskfile import TaskFileError, loads
     from services.comm.directory import DirectoryError, parse
 

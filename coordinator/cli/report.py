@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from coordinator.campaign.plan import Plan
     from coordinator.campaign.rows import Row
     from coordinator.cli.replaying import Recorded
-    from coordinator.recording import Step
+    from coordinator.record.recording import Step
     from coordinator.report.observed_run import ObservedRun
     from coordinator.task import Task
 
@@ -157,9 +157,9 @@ def _plots(folder: Path) -> dict[str, Any]:
 def _run(name: str) -> tuple[str, dict[str, str], Path]:
     from coordinator.cli.replaying import recorded
     from coordinator.drawing import draw
+    from coordinator.record.runfolder import RESULT
+    from coordinator.record.timeline import Timeline
     from coordinator.report.run_page import gantt_svg, own_pictures, report_html
-    from coordinator.runfolder import RESULT
-    from coordinator.timeline import Timeline
 
     found = recorded(name)
     timeline, observed = Timeline(), _observer(found)
@@ -181,8 +181,8 @@ def _run(name: str) -> tuple[str, dict[str, str], Path]:
 
 def _observer(found: Recorded) -> ObservedRun:
     """What sees the run's actions; with the selector that learned in it, as far as its estimates file is still there."""
-    from coordinator.estimates_file import EstimatesError
-    from coordinator.learning_session import session_of
+    from coordinator.experience.estimates_file import EstimatesError
+    from coordinator.experience.learning_session import session_of
     from coordinator.report.observed_run import ObservedRun
 
     try:
@@ -194,8 +194,8 @@ def _observer(found: Recorded) -> ObservedRun:
 
 
 def _steps(found: Recorded) -> Iterator[Step]:
-    from coordinator.journal import JournalError
-    from coordinator.recording import ReplayError
+    from coordinator.record.journal import JournalError
+    from coordinator.record.recording import ReplayError
 
     try:
         yield from found.steps()

@@ -11,9 +11,9 @@ from coordinator.cli import CommandError
 from coordinator.cli.replaying import Recorded, recorded
 
 if TYPE_CHECKING:
-    from coordinator.mission import Mission
-    from coordinator.partners import Observer
-    from coordinator.timeline import Timeline
+    from coordinator.mission.mission import Mission
+    from coordinator.mission.partners import Observer
+    from coordinator.record.timeline import Timeline
 
 EXAMPLE = "petrobot resume last --json out.json"
 
@@ -34,10 +34,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Resume."""
     from coordinator.cli.giving import give
-    from coordinator.journal import JournalError
-    from coordinator.mission import MissionError
-    from coordinator.recording import ReplayError
-    from coordinator.runfolder import RESULT
+    from coordinator.mission.mission import MissionError
+    from coordinator.record.journal import JournalError
+    from coordinator.record.recording import ReplayError
+    from coordinator.record.runfolder import RESULT
     from services.comm.cell import CellError
 
     found = recorded(options.run)
@@ -80,7 +80,7 @@ async def _resume(found: Recorded, options: argparse.Namespace) -> tuple[Mission
     from coordinator.cli.learning import resumed_selector, saved
     from coordinator.cli.run import drive
     from coordinator.launch import resumed_mission
-    from coordinator.timeline import Timeline
+    from coordinator.record.timeline import Timeline
 
     timeline = Timeline()
     now = asyncio.get_running_loop().time()

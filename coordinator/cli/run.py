@@ -28,10 +28,10 @@ from coordinator.cli.parameters import pairs, parameter_of
 
 if TYPE_CHECKING:
     from coordinator.launch import Setting
-    from coordinator.mission import Mission
-    from coordinator.realtime import RealtimeMission
+    from coordinator.mission.mission import Mission
+    from coordinator.mission.realtime import RealtimeMission
+    from coordinator.record.timeline import Timeline
     from coordinator.task import Task
-    from coordinator.timeline import Timeline
     from services.comm.directory import Directory
 
 MODES = ("realtime", "lockstep")
@@ -93,9 +93,9 @@ def add_page_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Check the task, run it, print and write the result."""
-    from coordinator.journal import JournalError
     from coordinator.launch import mission_id
-    from coordinator.mission import MissionError
+    from coordinator.mission.mission import MissionError
+    from coordinator.record.journal import JournalError
     from services.comm.directory import DirectoryError
 
     if options.departs is not None:
@@ -155,7 +155,7 @@ def _refuse_unfit(task: Task, directory: Directory) -> None:
 
 def _refuse_stopped(directory: Directory) -> None:
     """A run whose devices obey nobody would end at once, having done nothing."""
-    from coordinator.emergency import still_stopped
+    from coordinator.operator.emergency import still_stopped
 
     stopped = still_stopped(directory)
     if stopped:
@@ -165,7 +165,7 @@ def _refuse_stopped(directory: Directory) -> None:
 
 def _setting(task: Task, directory: Directory, options: argparse.Namespace) -> Setting:
     from coordinator.launch import Setting
-    from coordinator.partners import FirstAlternative
+    from coordinator.mission.partners import FirstAlternative
 
     given = dict(pairs("--set", options.set))
     if options.regime is not None:
@@ -207,7 +207,7 @@ async def _run_realtime(
     directory: Directory, setting: Setting, options: argparse.Namespace
 ) -> tuple[Mission, Timeline]:
     from coordinator.launch import realtime_mission
-    from coordinator.timeline import Timeline
+    from coordinator.record.timeline import Timeline
 
     timeline = Timeline()
     identity: str = options.identity
@@ -226,7 +226,7 @@ async def drive(
     directory: Directory, mission: Mission, options: argparse.Namespace, begin: Callable[[float], None] | None = None
 ) -> None:
     """Run a mission in real time over its nodes, launching those of this host first if asked to."""
-    from coordinator.realtime import RealtimeMission, UnreachableError, credentials_of
+    from coordinator.mission.realtime import RealtimeMission, UnreachableError, credentials_of
     from coordinator.supervisor import LaunchError
     from services.comm.security import KeyFileError
 
@@ -251,12 +251,12 @@ async def _page(shell: RealtimeMission, options: argparse.Namespace) -> AsyncIte
     """The operator's page, or with --no-page his protocol alone, while the mission run goes on."""
     from coordinator.cli.loading import SHIPPED
     from coordinator.cli.serve import OWN_TASKS
-    from coordinator.door_file import Door, door_open
     from coordinator.hmi.journals import JournalHistory
     from coordinator.hmi.server import start_page
-    from coordinator.operation import Operation
-    from coordinator.partners import FirstAlternative
-    from coordinator.station import offered
+    from coordinator.mission.partners import FirstAlternative
+    from coordinator.operator.door_file import Door, door_open
+    from coordinator.operator.operation import Operation
+    from coordinator.operator.station import offered
 
     selector = shell.mission.executor.selector
     assert isinstance(selector, FirstAlternative)

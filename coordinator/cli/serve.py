@@ -15,7 +15,7 @@ from coordinator.cli.loading import SHIPPED, add_services_argument, load_directo
 
 if TYPE_CHECKING:
     from coordinator.hmi.server import Page
-    from coordinator.station import Station
+    from coordinator.operator.station import Station
     from services.comm.directory import Directory
 
 EXAMPLE = "petrobot serve --up"
@@ -59,9 +59,9 @@ def run(options: argparse.Namespace) -> int:
 
 async def _serve(directory: Directory, options: argparse.Namespace) -> int:
     from coordinator.hmi.store import TaskStore
-    from coordinator.realtime import credentials_of
-    from coordinator.runfolder import DEFAULT
-    from coordinator.station import Station
+    from coordinator.mission.realtime import credentials_of
+    from coordinator.operator.station import Station
+    from coordinator.record.runfolder import DEFAULT
     from coordinator.supervisor import LaunchError
 
     stop = asyncio.Event()
@@ -109,7 +109,7 @@ async def _page(station: Station, runs: Path, options: argparse.Namespace, stop:
 
 
 def _doors(directory: Directory, page: Page) -> Any:
-    from coordinator.door_file import Door
+    from coordinator.operator.door_file import Door
 
     return lambda run: Door(run, page.base, page.token, os.getpid(), str(directory.source.resolve()))
 

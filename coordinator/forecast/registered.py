@@ -15,10 +15,10 @@ from coordinator.analysis.forecast import forecast as solve
 from coordinator.analysis.space import Limits
 from coordinator.analysis.stochastic import NoEstimate, stochastic_view
 from coordinator.campaign.observed import context_of
+from coordinator.experience.propagation import Choice, measured_from
 from coordinator.forecast.history import Training
 from coordinator.forecast.predict import Request, predict
 from coordinator.learning.learning import Estimates
-from coordinator.propagation import Choice, measured_from
 from coordinator.task import Task
 
 SCHEMA = 1

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from coordinator.campaign.observed import context_of, regime_of
 from coordinator.campaign.throws import RunEntry, Throw
-from coordinator.estimates_file import EstimatesError, EstimatesFile
+from coordinator.experience.estimates_file import EstimatesError, EstimatesFile
 from coordinator.forecast.history import Training
 from coordinator.forecast.registered import ForecastError
 from coordinator.learning.estimate import CENSORED, Tally

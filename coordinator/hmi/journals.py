@@ -11,9 +11,9 @@ from typing import Any
 from coordinator.engine import Engine, Fired, Phase, Report, RunRecorded, StartRun
 from coordinator.hmi.picture import picture
 from coordinator.hmi.telling import reason_of, told
-from coordinator.journal import Journal, JournalError, read_journal
-from coordinator.recording import ReplayError, Step, replay
-from coordinator.runfolder import JOURNAL, RESULT
+from coordinator.record.journal import Journal, JournalError, read_journal
+from coordinator.record.recording import ReplayError, Step, replay
+from coordinator.record.runfolder import JOURNAL, RESULT
 from coordinator.task import End, Task
 from coordinator.taskfile import TaskFileError, loads
 
@@ -22,7 +22,7 @@ RUNS_AT_MOST = 300
 
 
 class JournalHistory:
-    """The runs of one folder (`coordinator.runfolder`). Fits `coordinator.hmi.port.HistoryPort`."""
+    """The runs of one folder (`coordinator.record.runfolder`). Fits `coordinator.hmi.port.HistoryPort`."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder

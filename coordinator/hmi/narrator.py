@@ -46,7 +46,7 @@ _LEVEL = {Severity.NOTE: "info", Severity.WARNING: "warning", Severity.ERROR: "e
 
 
 class Narrator:
-    """Fills a feed. `where` gives the node of each action. Fits `coordinator.executor.Observer`.
+    """Fills a feed. `where` gives the node of each action. Fits `coordinator.mission.executor.Observer`.
 
     `settled` is to be called after each stimulus that the engine has handled, with the new state: it tells what no
     instruction says (latched events, variables, breakpoints).

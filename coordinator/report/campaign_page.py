@@ -12,6 +12,7 @@ from coordinator.campaign.rows import Row
 from coordinator.campaign.summary import Summary, comparisons
 from coordinator.campaign.throws import Throw
 from coordinator.learning.objective import Figures, break_even, pareto
+from coordinator.record.timeline import Bar, Timeline
 from coordinator.report import charts
 from coordinator.report.action_pictures import (
     ACTIONS,
@@ -28,7 +29,6 @@ from coordinator.report.plots import declared
 from coordinator.report.run_page import gantt_svg
 from coordinator.report.trials import learned_curves, objective_curves
 from coordinator.task import Status, Task
-from coordinator.timeline import Bar, Timeline
 
 DIFFERENCES = "Differences, paired"
 AHEAD = (DIFFERENCES, TRIALS, ACTIONS)

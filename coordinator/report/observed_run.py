@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from coordinator.learner import LearningSelector
+from coordinator.experience.learner import LearningSelector
 from coordinator.learning.learning import Learning
 from coordinator.learning.records import End, Record
-from coordinator.recording import Step
+from coordinator.record.recording import Step
 from coordinator.report.action_pictures import (
     Pictures,
     action_pictures,

@@ -6,10 +6,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
+from coordinator.record.timeline import Bar, Timeline
 from coordinator.report.page import apart, gallery, html_page, is_table, numbers, picture, section, status, table
 from coordinator.report.plots import declared, finished
 from coordinator.task import Status
-from coordinator.timeline import Bar, Timeline
 
 ROW, LEFT, WIDTH = 26, 150, 1040
 SECOND = 10.0

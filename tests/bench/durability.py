@@ -23,11 +23,11 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from coordinator.journal import JournalWriter
 from coordinator.launch import Setting, local_programs, realtime_mission
-from coordinator.partners import Forgetful, Store
-from coordinator.realtime import RealtimeMission
-from coordinator.recording import JournalStore
+from coordinator.mission.partners import Forgetful, Store
+from coordinator.mission.realtime import RealtimeMission
+from coordinator.record.journal import JournalWriter
+from coordinator.record.recording import JournalStore
 from coordinator.supervisor import Supervisor
 from coordinator.taskfile import loads
 from services.comm.caller import Caller

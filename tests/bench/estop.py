@@ -28,8 +28,8 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from coordinator.emergency import CLEAR, STOP, EmergencyLine
 from coordinator.launch import local_programs
+from coordinator.operator.emergency import CLEAR, STOP, EmergencyLine
 from coordinator.supervisor import Supervisor
 from services.comm.caller import Caller
 from services.comm.cia402 import State

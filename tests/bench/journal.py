@@ -12,7 +12,7 @@ from pathlib import Path
 
 import msgpack
 
-from coordinator.journal import JournalWriter
+from coordinator.record.journal import JournalWriter
 
 RECORD = {
     "stimulus": {"kind": "RunEnded", "run": "action#1", "values": {"point": [[0.1, 1.0, 0.2]] * 8}, "seconds": 0.4}

@@ -17,7 +17,7 @@ from coordinator.campaign.throws import RunEntry, Throw, ThrowLog
 from coordinator.cli.loading import load_task
 from coordinator.engine.instructions import Corrected
 from coordinator.launch import Setting, lockstep_cell
-from coordinator.mission import Mission
+from coordinator.mission.mission import Mission
 from coordinator.task import Status
 from coordinator.taskfile import load
 from services.action import Status as ActionStatus

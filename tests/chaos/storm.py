@@ -24,10 +24,10 @@ import numpy as np
 from coordinator.cli.loading import load_task
 from coordinator.cli.replaying import recorded
 from coordinator.engine import Finished, Fired, RunRecorded, StartRun
-from coordinator.journal import JournalError, read_journal
 from coordinator.launch import local_programs, with_runs
-from coordinator.recording import STIMULUS
-from coordinator.runfolder import JOURNAL, RESULT
+from coordinator.record.journal import JournalError, read_journal
+from coordinator.record.recording import STIMULUS
+from coordinator.record.runfolder import JOURNAL, RESULT
 from coordinator.supervisor import Supervisor
 from coordinator.task import Status
 from services.comm.directory import load

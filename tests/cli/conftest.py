@@ -14,14 +14,14 @@ import pytest
 import pytest_asyncio
 
 from coordinator.cli import main
-from coordinator.door_file import Door, door_open
 from coordinator.hmi.server import Page, start_page
 from coordinator.launch import Setting, realtime_mission
-from coordinator.mission import Mission
-from coordinator.operation import Operation
-from coordinator.partners import FirstAlternative
-from coordinator.realtime import RealtimeMission
-from coordinator.runfolder import JOURNAL
+from coordinator.mission.mission import Mission
+from coordinator.mission.partners import FirstAlternative
+from coordinator.mission.realtime import RealtimeMission
+from coordinator.operator.door_file import Door, door_open
+from coordinator.operator.operation import Operation
+from coordinator.record.runfolder import JOURNAL
 from coordinator.taskfile import loads
 from tests.cli.cell import TASK, Arm, RobotNode, directory_in
 from tests.waiting import beat

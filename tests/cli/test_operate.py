@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from coordinator.cli import COMMANDS, main
-from coordinator.door_file import DOOR, Door, door_open, find_door
 from coordinator.engine import Mode
 from coordinator.hmi import house
-from coordinator.runfolder import JOURNAL, NoRunError
+from coordinator.operator.door_file import DOOR, Door, door_open, find_door
+from coordinator.record.runfolder import JOURNAL, NoRunError
 from tests.cli.conftest import RUN, Terminal
 from tests.waiting import beat
 

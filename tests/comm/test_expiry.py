@@ -17,9 +17,9 @@ from cryptography import x509
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coordinator.asking import ask_all
 from coordinator.certificates import CA_LIFE, LIFE, CertificateError, make_certificates
 from coordinator.cli import main
+from coordinator.mission.asking import ask_all
 from services.comm import expiry
 from services.comm import messages as m
 from services.comm.callee import Callee, Offer

@@ -12,12 +12,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from coordinator.cli import main
-from coordinator.departure import ENDS, DepartureError, departed_store, departing, departure
 from coordinator.engine import Engine, Phase
-from coordinator.journal import Journal, read_journal
 from coordinator.launch import Setting, lockstep_cell, lockstep_id
-from coordinator.recording import JournalStore, replay
-from coordinator.runfolder import JOURNAL
+from coordinator.operator.departure import ENDS, DepartureError, departed_store, departing, departure
+from coordinator.record.journal import Journal, read_journal
+from coordinator.record.recording import JournalStore, replay
+from coordinator.record.runfolder import JOURNAL
 from coordinator.task import Task
 from coordinator.taskfile import load
 from services.comm.directory import Directory, parse
@@ -175,7 +175,7 @@ def test_a_killed_departed_run_is_made_again(cell: Path) -> None:
 
 
 def _write(path: Path, whole: Journal, records: int) -> None:
-    from coordinator.journal import JournalWriter
+    from coordinator.record.journal import JournalWriter
 
     given: Mapping[str, Any] = dict(whole.header)
     writer = JournalWriter(path, given)

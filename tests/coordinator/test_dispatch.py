@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.dispatch import ESCALATION
 from coordinator.engine import Begin, Hold, Pause, Phase, Resume
-from coordinator.fences import STOP_MARGIN
-from coordinator.journal import JournalError, JournalWriter
-from coordinator.recording import JournalStore
+from coordinator.mission.dispatch import ESCALATION
+from coordinator.mission.fences import STOP_MARGIN
+from coordinator.record.journal import JournalError, JournalWriter
+from coordinator.record.recording import JournalStore
 from coordinator.task import Executed, Status
 from services.comm import messages as m
 from tests.coordinator.toy_arm import TIDY, WORK, Bench

@@ -14,7 +14,7 @@ import pytest
 from coordinator.cli import main
 from coordinator.cli.replaying import recorded
 from coordinator.engine import Fired, RunRecorded
-from coordinator.mcap_export import messages
+from coordinator.record.mcap_export import messages
 
 JOURNAL = Path(__file__).parent / "golden" / "catch_ball-missed-and-recovered.journal"
 

@@ -8,8 +8,8 @@ import pytest
 
 from coordinator.cli.replaying import recorded
 from coordinator.engine import Engine, Finished, Fired, State
-from coordinator.journal import read_journal
-from coordinator.recording import ReplayError, replay
+from coordinator.record.journal import read_journal
+from coordinator.record.recording import ReplayError, replay
 from tests.coordinator.golden.make import STORIES, make
 
 GOLDEN = Path(__file__).parent / "golden"

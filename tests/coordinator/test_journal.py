@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coordinator.journal import MAGIC, JournalError, JournalWriter, read_journal
+from coordinator.record.journal import MAGIC, JournalError, JournalWriter, read_journal
 
 PLAIN = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**60), 2**60) | st.floats(allow_nan=False) | st.text(max_size=20),
@@ -137,7 +137,7 @@ def test_a_place_where_no_journal_can_be_is_refused(tmp_path: Path) -> None:
 KILLED = """
 import sys
 from pathlib import Path
-from coordinator.journal import JournalWriter
+from coordinator.record.journal import JournalWriter
 writer = JournalWriter(Path(sys.argv[1]), {})
 number = 0
 while True:

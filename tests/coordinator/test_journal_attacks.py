@@ -13,9 +13,9 @@ import pytest
 from coordinator.cli import CommandError
 from coordinator.cli.replaying import recorded
 from coordinator.engine import Begin, Engine
-from coordinator.journal import MAGIC, PREFIX, JournalError, JournalWriter, read_journal
 from coordinator.launch import resumed_mission
-from coordinator.recording import JournalStore, ReplayError
+from coordinator.record.journal import MAGIC, PREFIX, JournalError, JournalWriter, read_journal
+from coordinator.record.recording import JournalStore, ReplayError
 from services.comm import messages as m
 from tests.coordinator.toy_arm import WORK, Bench
 
@@ -142,7 +142,7 @@ def test_a_journal_that_may_not_be_written_is_said_to_be(tmp_path: Path, monkeyp
     def refused(*given: Any, **more: Any) -> int:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
-    monkeypatch.setattr("coordinator.journal.os.open", refused)
+    monkeypatch.setattr("coordinator.record.journal.os.open", refused)
     with pytest.raises(JournalError, match=r"run\.journal: Read-only file system; it can be gone on with only where"):
         JournalWriter(path)
 
@@ -169,7 +169,7 @@ def test_what_a_full_disk_has_taken_in_part_is_gone_on_with(
     """Every place at which a write can stop: once there is room again, each record stands in the file once and whole."""
     writer = JournalWriter(tmp_path / "run.journal", {})
     disk = SmallDisk(room)
-    monkeypatch.setattr("coordinator.journal.os.write", disk)
+    monkeypatch.setattr("coordinator.record.journal.os.write", disk)
     for number in range(3):
         writer.append("n", {"n": number})
     with pytest.raises(JournalError, match=r"No space left on device; nothing was sent on the strength of it"):
@@ -186,7 +186,7 @@ def full(folder: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Bench, Callable
     writer = JournalWriter(folder / "run.journal", {"mission": "m"})
     bench = Bench(store=JournalStore(writer, 0.0)).begin()
     disk = SmallDisk(5)
-    monkeypatch.setattr("coordinator.journal.os.write", disk)
+    monkeypatch.setattr("coordinator.record.journal.os.write", disk)
 
     def room() -> None:
         disk.room = 10_000

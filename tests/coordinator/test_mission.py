@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 
 from coordinator.launch import Setting, lockstep_cell
-from coordinator.mission import Mission
-from coordinator.partners import FirstAlternative
+from coordinator.mission.mission import Mission
+from coordinator.mission.partners import FirstAlternative
+from coordinator.record.timeline import Timeline
 from coordinator.task import Status, Task
-from coordinator.timeline import Timeline
 from services.action import Status as ActionStatus
 from services.scripted import Line
 from tests.coordinator.scripted_cell import directory_for, scripts

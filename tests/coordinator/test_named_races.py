@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import pytest
 
-from coordinator.dispatch import ESCALATION
 from coordinator.engine import Abort, Begin, CancelRun, RunRecorded
-from coordinator.fences import STOP_MARGIN
+from coordinator.mission.dispatch import ESCALATION
+from coordinator.mission.fences import STOP_MARGIN
 from coordinator.task import Executed, Status
 from services.comm import messages as m
 from tests.coordinator.toy_arm import TIDY, WORK, Bench

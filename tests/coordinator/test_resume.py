@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from coordinator.engine import Engine, Instruction, Override, State, Stimulus
-from coordinator.journal import JournalWriter, read_journal
 from coordinator.launch import Setting, lockstep_party, make_mission, resumed_mission, with_runs
-from coordinator.lockstep_party import CoordinatorParty
-from coordinator.mission import Mission
-from coordinator.recording import JournalStore, ReplayError, replay
+from coordinator.mission.lockstep_party import CoordinatorParty
+from coordinator.mission.mission import Mission
+from coordinator.record.journal import JournalWriter, read_journal
+from coordinator.record.recording import JournalStore, ReplayError, replay
 from coordinator.task import Status, Task
 from services.action import Status as ActionStatus
 from services.comm.cell import Cell

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from coordinator.engine import Abort, Hold, Mode, Pause, Resume, RunHeld, SetBreakpoints, Step
-from coordinator.fences import STOP_MARGIN
+from coordinator.mission.fences import STOP_MARGIN
 from coordinator.task import Executed, Status
 from services.comm import messages as m
 from tests.coordinator.toy_arm import TIDY, WORK, Bench

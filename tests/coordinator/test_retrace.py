@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from coordinator.cli import main
-from coordinator.journal import JournalWriter, read_journal
-from coordinator.recording import ReplayError, RetracingStore
-from coordinator.runfolder import JOURNAL, RESULT
+from coordinator.record.journal import JournalWriter, read_journal
+from coordinator.record.recording import ReplayError, RetracingStore
+from coordinator.record.runfolder import JOURNAL, RESULT
 from tests.coordinator.test_runfolder import SCRIPT, SERVICES
 
 TASK = Path(__file__).parents[1] / "chaos" / "shuttle.toml"

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from coordinator.cli import main
-from coordinator.journal import JournalWriter
-from coordinator.runfolder import JOURNAL, RESULT, NoRunError, journal_of, retain
+from coordinator.record.journal import JournalWriter
+from coordinator.record.runfolder import JOURNAL, RESULT, NoRunError, journal_of, retain
 
 SERVICES = """
 schema = 1

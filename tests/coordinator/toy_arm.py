@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from coordinator.engine import Begin, Engine, Fired, Instruction, Report, RunRecorded, State, Stimulus
-from coordinator.executor import Executor
-from coordinator.partners import Forgetful, Store
-from coordinator.recording import Step
+from coordinator.mission.executor import Executor
+from coordinator.mission.partners import Forgetful, Store
+from coordinator.record.recording import Step
 from coordinator.taskfile import loads
 from services.comm import messages as m
 from services.comm.caller import Caller

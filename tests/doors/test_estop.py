@@ -16,10 +16,10 @@ from typing import Any
 
 import pytest
 
-from coordinator.door_file import find_door
-from coordinator.emergency import still_stopped
 from coordinator.launch import local_programs
-from coordinator.runfolder import NoRunError
+from coordinator.operator.door_file import find_door
+from coordinator.operator.emergency import still_stopped
+from coordinator.record.runfolder import NoRunError
 from coordinator.supervisor import Supervisor
 from services.comm.canopen import NmtState
 from services.comm.cia402 import State

@@ -18,8 +18,8 @@ import pytest
 
 from coordinator.certificates import make_certificates
 from coordinator.cli import main
-from coordinator.door_file import DOOR
 from coordinator.launch import local_programs
+from coordinator.operator.door_file import DOOR
 from coordinator.supervisor import Supervisor
 from services.comm.directory import parse
 from services.comm.security import new_key, write_key

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
-from coordinator.departure import point_of
 from coordinator.engine import (
     Begin,
     Engine,
@@ -23,6 +22,7 @@ from coordinator.engine import (
     point_from_plain,
     to_plain,
 )
+from coordinator.operator.departure import point_of
 from coordinator.task import Status, Task
 from tests.engine.conftest import make_task
 from tests.engine.test_properties import DEVICES, Journal, tasks

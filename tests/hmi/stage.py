@@ -43,9 +43,9 @@ from coordinator.engine import (
 )
 from coordinator.hmi.feed import Feed
 from coordinator.hmi.narrator import Narrator
-from coordinator.journal import JournalWriter
-from coordinator.recording import JournalStore
-from coordinator.runfolder import JOURNAL, header
+from coordinator.record.journal import JournalWriter
+from coordinator.record.recording import JournalStore
+from coordinator.record.runfolder import JOURNAL, header
 from coordinator.task import Executed, Status, Task
 from coordinator.taskfile import TaskFileError, loads
 from services.comm.notice import Progress

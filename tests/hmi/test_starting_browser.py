@@ -12,8 +12,8 @@ import pytest_asyncio
 
 from coordinator.hmi.journals import JournalHistory
 from coordinator.hmi.server import Page, start_page
-from coordinator.journal import read_journal
-from coordinator.runfolder import JOURNAL
+from coordinator.record.journal import read_journal
+from coordinator.record.runfolder import JOURNAL
 from tests.hmi.conftest import browser_missing
 from tests.station.conftest import TASK
 from tests.station.test_starting import REMARKED, Simulated

@@ -23,12 +23,12 @@ from coordinator import launch
 from coordinator.cli.loading import load_task
 from coordinator.cli.replaying import recorded
 from coordinator.engine import Engine, Fired, Instruction, RunRecorded, State, Stimulus
-from coordinator.journal import JournalWriter, read_journal
 from coordinator.launch import Setting, lockstep_party, make_mission, resumed_mission, with_runs
-from coordinator.lockstep_party import NAME, CoordinatorParty
-from coordinator.mission import Mission
-from coordinator.recording import JournalStore
-from coordinator.runfolder import header
+from coordinator.mission.lockstep_party import NAME, CoordinatorParty
+from coordinator.mission.mission import Mission
+from coordinator.record.journal import JournalWriter, read_journal
+from coordinator.record.recording import JournalStore
+from coordinator.record.runfolder import header
 from services.comm.cell import Delays
 from services.comm.directory import Directory, load, resolve
 from services.comm.lockstep import Member

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.journal import read_journal
-from coordinator.runfolder import JOURNAL
+from coordinator.record.journal import read_journal
+from coordinator.record.runfolder import JOURNAL
 from tests.chaos.shuttle_cell import ROOT, TASK, moves, shuttle_services
 from tests.integration.test_resume_processes import PATIENCE, QUIET, nodes, petrobot
 

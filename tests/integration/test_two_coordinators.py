@@ -9,8 +9,8 @@ import pytest
 
 from coordinator.cli.loading import load_task
 from coordinator.launch import Setting, local_programs, mission_id, realtime_mission
-from coordinator.mission import Mission
-from coordinator.realtime import RealtimeMission
+from coordinator.mission.mission import Mission
+from coordinator.mission.realtime import RealtimeMission
 from coordinator.supervisor import Supervisor
 from coordinator.task import Executed, Status
 from services.comm.directory import Directory, load

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from coordinator.engine import Stimulus
+from coordinator.experience.learner import LearningSelector
 from coordinator.launch import Setting, lockstep_cell
-from coordinator.learner import LearningSelector
-from coordinator.mission import Mission
-from coordinator.partners import FirstAlternative, Store
+from coordinator.mission.mission import Mission
+from coordinator.mission.partners import FirstAlternative, Store
 from coordinator.task import Task
 from coordinator.taskfile import load
 from services.action import Status

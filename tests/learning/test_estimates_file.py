@@ -12,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from coordinator.estimates_file import EstimatesError, EstimatesFile, Kept
+from coordinator.experience.estimates_file import EstimatesError, EstimatesFile, Kept
 from coordinator.learning.estimate import Key, Observation
 from coordinator.learning.learning import Estimates
 from coordinator.learning.passage import Flow, PassageKey

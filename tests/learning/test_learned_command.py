@@ -10,12 +10,12 @@ import pytest
 
 from coordinator.cli import main
 from coordinator.engine import Engine
-from coordinator.estimates_file import EstimatesFile
-from coordinator.journal import JournalWriter, read_journal
+from coordinator.experience.estimates_file import EstimatesFile
+from coordinator.experience.learning_session import LearningSession, LearningSetting, session_of
 from coordinator.launch import resumed_mission, with_runs
 from coordinator.learning.estimate import Key
-from coordinator.learning_session import LearningSession, LearningSetting, session_of
-from coordinator.recording import JournalStore
+from coordinator.record.journal import JournalWriter, read_journal
+from coordinator.record.recording import JournalStore
 from tests.learning.cell import TASK_FILE, directory, run, sorting
 
 SERVICES = """

@@ -14,16 +14,16 @@ import pytest
 
 from coordinator.engine import Engine, Override, State
 from coordinator.engine.instructions import Corrected, RunRecorded, StartRun
-from coordinator.journal import JournalWriter, read_journal
+from coordinator.experience.learner import ContextError, Contexts, LearningSelector, usual_contexts
 from coordinator.launch import Setting, lockstep_cell, with_runs
-from coordinator.learner import ContextError, Contexts, LearningSelector, usual_contexts
 from coordinator.learning.estimate import Key
 from coordinator.learning.learning import Learning
 from coordinator.learning.records import Choice, End, Passage, of_plain, to_plain
 from coordinator.learning.selectors import RULES
-from coordinator.operation import Operation
-from coordinator.realtime import RealtimeMission
-from coordinator.recording import JournalStore, replay
+from coordinator.mission.realtime import RealtimeMission
+from coordinator.operator.operation import Operation
+from coordinator.record.journal import JournalWriter, read_journal
+from coordinator.record.recording import JournalStore, replay
 from coordinator.task import Executed, Status, Task
 from tests.learning.cell import directory, run, scripts, sorting
 

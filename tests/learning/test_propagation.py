@@ -14,12 +14,12 @@ from coordinator.analysis.completion import completion
 from coordinator.analysis.forecast import forecast
 from coordinator.analysis.gspn import Chain
 from coordinator.analysis.stochastic import Measured, stochastic_view
+from coordinator.experience.learner import LearningSelector
+from coordinator.experience.propagation import measured_from, propagate
 from coordinator.launch import with_runs
-from coordinator.learner import LearningSelector
 from coordinator.learning.competing import incidences
 from coordinator.learning.estimate import Key, Observation, Tally
 from coordinator.learning.learning import Estimates, Learning
-from coordinator.propagation import measured_from, propagate
 from coordinator.task import Estimate, Executed, Status, Task
 from coordinator.taskfile import loads
 from tests.learning.cell import run, sorting

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coordinator.launch import Setting, lockstep_cell
-from coordinator.partners import FirstAlternative
+from coordinator.mission.partners import FirstAlternative
 from coordinator.taskfile import load
 from services.comm.directory import load as load_directory
 from services.mobile.detection import Detector, TemplateBank, consensus, detect_edges, detect_ridge

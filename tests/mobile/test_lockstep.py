@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from coordinator.launch import Setting, lockstep_mission, lockstep_party
-from coordinator.lockstep_party import CoordinatorParty
-from coordinator.partners import FirstAlternative
+from coordinator.mission.lockstep_party import CoordinatorParty
+from coordinator.mission.partners import FirstAlternative
 from coordinator.taskfile import load
 from services.comm.cell import Cell, Delays
 from services.comm.directory import load as load_directory

@@ -19,8 +19,13 @@ SEED = 20_000
 FLOORS = {"A": 0.98, "B": 0.94, "C": 0.89}
 SOURCES = (
     *("coordinator/engine", "coordinator/task", "coordinator/taskfile", "coordinator/conditions"),
-    *("coordinator/net.py", "coordinator/executor.py", "coordinator/partners.py", "coordinator/mission.py"),
-    *("coordinator/lockstep_party.py", "coordinator/tasks/catch_ball.toml", "services.toml", "services", "sim"),
+    *(
+        "coordinator/net.py",
+        "coordinator/mission/executor.py",
+        "coordinator/mission/partners.py",
+        "coordinator/mission/mission.py",
+    ),
+    *("coordinator/mission/lockstep_party.py", "coordinator/tasks/catch_ball.toml", "services.toml", "services", "sim"),
 )
 APART = ("services/mobile", "sim/track", "sim/rover")
 

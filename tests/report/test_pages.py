@@ -246,11 +246,11 @@ def test_report_of_a_recorded_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """From the journal alone, with the task's own pictures once there is a result."""
-    from coordinator.journal import JournalWriter
     from coordinator.launch import Setting, lockstep_party, make_mission, with_runs
-    from coordinator.lockstep_party import CoordinatorParty
-    from coordinator.recording import JournalStore
-    from coordinator.runfolder import JOURNAL, RESULT, header
+    from coordinator.mission.lockstep_party import CoordinatorParty
+    from coordinator.record.journal import JournalWriter
+    from coordinator.record.recording import JournalStore
+    from coordinator.record.runfolder import JOURNAL, RESULT, header
     from services.comm.cell import Cell
     from services.comm.directory import load as load_directory
 

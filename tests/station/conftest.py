@@ -10,7 +10,7 @@ from typing import Any
 import pytest_asyncio
 
 from coordinator.hmi.store import TaskStore
-from coordinator.station import Station
+from coordinator.operator.station import Station
 from services.comm.directory import Directory, parse
 from services.node import GENERAL, Node
 from services.place import InlinePlace

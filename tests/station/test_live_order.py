@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.journal import read_journal
-from coordinator.runfolder import JOURNAL
+from coordinator.record.journal import read_journal
+from coordinator.record.runfolder import JOURNAL
 from tests.station.conftest import Cell
 
 

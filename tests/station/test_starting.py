@@ -13,16 +13,16 @@ import pytest_asyncio
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from coordinator import station
 from coordinator.cli import main
-from coordinator.emergency import CLEAR, STOP
 from coordinator.hmi.journals import opened
 from coordinator.hmi.store import TaskStore
-from coordinator.journal import read_journal
-from coordinator.runfolder import JOURNAL, RESULT
-from coordinator.simulated_run import SimulatedRun
-from coordinator.start_order import StartOrder, read_depart, read_start, start_form
-from coordinator.station import Station
+from coordinator.operator import station
+from coordinator.operator.emergency import CLEAR, STOP
+from coordinator.operator.simulated_run import SimulatedRun
+from coordinator.operator.start_order import StartOrder, read_depart, read_start, start_form
+from coordinator.operator.station import Station
+from coordinator.record.journal import read_journal
+from coordinator.record.runfolder import JOURNAL, RESULT
 from coordinator.taskfile import loads
 from services.comm.directory import parse
 from tests.station.conftest import SCRIPT, SERVICES, TASK, Cell

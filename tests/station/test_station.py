@@ -7,10 +7,10 @@ import os
 
 import pytest
 
-from coordinator.door_file import Door, find_door
 from coordinator.hmi.journals import opened
-from coordinator.journal import read_journal
-from coordinator.runfolder import JOURNAL, RESULT, NoRunError
+from coordinator.operator.door_file import Door, find_door
+from coordinator.record.journal import read_journal
+from coordinator.record.runfolder import JOURNAL, RESULT, NoRunError
 from tests.station.conftest import TASK, Cell
 
 

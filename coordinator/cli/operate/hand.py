@@ -15,8 +15,8 @@ from coordinator.cli import CommandError
 from coordinator.cli.loading import write_json
 
 if TYPE_CHECKING:
-    from coordinator.door_file import Door
     from coordinator.hmi.client import OperatorClient
+    from coordinator.operator.door_file import Door
 
 Answer = dict[str, Any]
 BAD_INPUT = frozenset({"bad_data", "unknown", "unknown_command"})
@@ -98,8 +98,8 @@ def show(options: argparse.Namespace, answer: Mapping[str, Any], text: str) -> N
 
 def find(options: argparse.Namespace) -> Door:
     """The door of the run that is meant."""
-    from coordinator.door_file import find_door
-    from coordinator.runfolder import NoRunError
+    from coordinator.operator.door_file import find_door
+    from coordinator.record.runfolder import NoRunError
 
     try:
         return find_door(options.run, options.journal)

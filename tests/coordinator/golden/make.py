@@ -10,10 +10,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from coordinator.cli.loading import load_task, task_path
-from coordinator.journal import JournalWriter
 from coordinator.launch import Setting, lockstep_cell, lockstep_id, with_runs
-from coordinator.recording import JournalStore
-from coordinator.runfolder import header
+from coordinator.record.journal import JournalWriter
+from coordinator.record.recording import JournalStore
+from coordinator.record.runfolder import header
 from services.action import Status
 from services.comm.directory import parse
 from services.scripted import Line

@@ -18,7 +18,7 @@ from typing import Any
 import msgpack
 
 from coordinator.engine import Engine, Instruction, State, Stimulus, stimulus_from_plain, to_plain
-from coordinator.journal import Journal, JournalError, JournalWriter
+from coordinator.record.journal import Journal, JournalError, JournalWriter
 
 STIMULUS = "stimulus"
 NODE = "node"

@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from coordinator.hmi.feed import Feed
-from coordinator.journal import JournalWriter
 from coordinator.launch import Setting, mission_id, realtime_mission, with_runs
-from coordinator.led_run import LedRun
-from coordinator.partners import FirstAlternative
-from coordinator.realtime import RealtimeMission, credentials_of
-from coordinator.recording import JournalStore, clock_reading
-from coordinator.runfolder import JOURNAL, header
-from coordinator.start_order import StartOrder
+from coordinator.mission.partners import FirstAlternative
+from coordinator.mission.realtime import RealtimeMission, credentials_of
+from coordinator.operator.led_run import LedRun
+from coordinator.operator.start_order import StartOrder
+from coordinator.record.journal import JournalWriter
+from coordinator.record.recording import JournalStore, clock_reading
+from coordinator.record.runfolder import JOURNAL, header
 from coordinator.task import Task
 from services.comm.directory import Directory
 

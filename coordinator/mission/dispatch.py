@@ -22,9 +22,9 @@ from coordinator.engine.instructions import (
     StartRun,
 )
 from coordinator.engine.stimuli import Hold, Pause, RunEnded, RunHeld, RunStarted, StopConfirmed, StopFailed, TimerFired
-from coordinator.fences import FOR_GOOD, UNSURE, Fences
+from coordinator.mission.fences import FOR_GOOD, UNSURE, Fences
+from coordinator.mission.timekeeping import Timers
 from coordinator.task import Executed, Status
-from coordinator.timekeeping import Timers
 from services.comm.caller import Caller
 from services.comm.directory import Directory
 from services.comm.messages import Answer, Call, Command, Outcome

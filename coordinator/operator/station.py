@@ -1,8 +1,8 @@
 """A coordinator that stays: one page over any number of mission runs, idle until the operator starts one.
 
-Implements `coordinator.hmi.port.MissionPort`. The feed and who holds the controls outlive each run, which
-`coordinator.mission_run.MissionRun` leads. What is idle is looked after here: which nodes are up, breakpoints and choices for the
-next run, and the emergency stop.
+Implements `coordinator.hmi.port.MissionPort`. The feed and who holds the controls outlive each run, which a `MissionRun` or a
+`SimulatedRun` leads. What is idle is looked after here: which nodes are up, breakpoints and choices for the next run, and the
+emergency stop.
 """
 
 from __future__ import annotations
@@ -13,22 +13,22 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
-from coordinator.asking import ask_all
-from coordinator.controls import Answer, Controls, refusal
-from coordinator.door_file import Door
-from coordinator.emergency import CLEAR, STOP, order_all
 from coordinator.hmi import verdicts
 from coordinator.hmi.feed import Feed
 from coordinator.hmi.narrator import Narrator
 from coordinator.hmi.store import StoreError, TaskStore, TaskText
-from coordinator.partners import FirstAlternative
-from coordinator.realtime import UnreachableError, credentials_of
-from coordinator.simulated_run import SimulatedRun
-from coordinator.start_order import LOCKSTEP, StartOrder, read_start, start_form
-from coordinator.starting import FAULTS, Starting
+from coordinator.mission.asking import ask_all
+from coordinator.mission.partners import FirstAlternative
+from coordinator.mission.realtime import UnreachableError, credentials_of
+from coordinator.operator.controls import Answer, Controls, refusal
+from coordinator.operator.door_file import Door
+from coordinator.operator.emergency import CLEAR, STOP, order_all
+from coordinator.operator.simulated_run import SimulatedRun
+from coordinator.operator.start_order import LOCKSTEP, StartOrder, read_start, start_form
+from coordinator.operator.starting import FAULTS, Starting
+from coordinator.operator.watching import shown_selectors
 from coordinator.task import Task
 from coordinator.taskfile import TaskFileError, loads
-from coordinator.watching import shown_selectors
 from services.comm.directory import Directory
 
 LOOK, PATIENCE = 2.0, 1.5

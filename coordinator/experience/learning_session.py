@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from coordinator.estimates_file import EstimatesError, EstimatesFile, Kept
-from coordinator.learner import Contexts, LearningSelector, usual_contexts
+from coordinator.experience.estimates_file import EstimatesError, EstimatesFile, Kept
+from coordinator.experience.learner import Contexts, LearningSelector, usual_contexts
 from coordinator.learning.learning import Estimates, Learning
 from coordinator.learning.objective import Question
 from coordinator.learning.selectors import DEFAULT, RULES

@@ -22,7 +22,7 @@ from coordinator.engine.stimuli import Chosen, RunEnded, Stimulus
 from coordinator.learning.estimate import Observation
 from coordinator.learning.learning import Learning
 from coordinator.learning.records import Choice, Correction, End, Passage, Record
-from coordinator.partners import FirstAlternative
+from coordinator.mission.partners import FirstAlternative
 from coordinator.task import Task
 from services.comm.notice import Progress
 

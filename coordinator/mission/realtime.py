@@ -6,8 +6,8 @@ import asyncio
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
-from coordinator.journal import JournalError
-from coordinator.mission import Mission, MissionError, Stage
+from coordinator.mission.mission import Mission, MissionError, Stage
+from coordinator.record.journal import JournalError
 from services.comm.client import Client
 from services.comm.credentials import COORDINATOR, Credentials, credentials
 from services.comm.directory import Directory

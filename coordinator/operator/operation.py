@@ -10,8 +10,6 @@ import asyncio
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, Protocol
 
-from coordinator.controls import Answer, Controls, refusal
-from coordinator.emergency import CLEAR, STOP, order_all
 from coordinator.engine import (
     Abort,
     AddTokens,
@@ -30,11 +28,13 @@ from coordinator.engine import (
 )
 from coordinator.hmi.feed import Feed
 from coordinator.hmi.narrator import Narrator
-from coordinator.journal import JournalError
-from coordinator.mission import Mission, Stage
-from coordinator.partners import FirstAlternative
-from coordinator.realtime import credentials_of
-from coordinator.watching import Watching, shown_selectors
+from coordinator.mission.mission import Mission, Stage
+from coordinator.mission.partners import FirstAlternative
+from coordinator.mission.realtime import credentials_of
+from coordinator.operator.controls import Answer, Controls, refusal
+from coordinator.operator.emergency import CLEAR, STOP, order_all
+from coordinator.operator.watching import Watching, shown_selectors
+from coordinator.record.journal import JournalError
 from services.comm.notice import Progress
 
 ANSWERS = 1.5

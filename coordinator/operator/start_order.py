@@ -17,10 +17,10 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import Item
 
-from coordinator.departure import AGAIN
-from coordinator.learner import usual_contexts
+from coordinator.experience.learner import usual_contexts
+from coordinator.experience.learning_session import LearningSession, LearningSetting
 from coordinator.learning.selectors import DEFAULT, RULES
-from coordinator.learning_session import LearningSession, LearningSetting
+from coordinator.operator.departure import AGAIN
 from coordinator.task import Task
 from services.comm.directory import Directory
 

@@ -13,7 +13,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from coordinator.dispatch import Dispatch
 from coordinator.engine import Engine
 from coordinator.engine.instructions import (
     CancelRun,
@@ -26,8 +25,9 @@ from coordinator.engine.instructions import (
     Subject,
 )
 from coordinator.engine.stimuli import Chosen, EventOccurred, RunRaised, Stimulus, VariableChanged
-from coordinator.partners import FirstAlternative, Forgetful, Observer, Selector, Store
-from coordinator.recording import Step
+from coordinator.mission.dispatch import Dispatch
+from coordinator.mission.partners import FirstAlternative, Forgetful, Observer, Selector, Store
+from coordinator.record.recording import Step
 from coordinator.task import Scope, Task
 from services.comm.caller import Caller
 from services.comm.directory import Directory

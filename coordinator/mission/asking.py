@@ -7,7 +7,7 @@ import secrets
 from datetime import UTC, datetime
 from typing import Any
 
-from coordinator.realtime import credentials_of
+from coordinator.mission.realtime import credentials_of
 from services.comm.caller import Caller
 from services.comm.client import Client
 from services.comm.directory import Directory

@@ -10,9 +10,9 @@ from typing import Any
 from coordinator.engine import Mode, State
 from coordinator.engine.instructions import Fired, Instruction, Report, RunRecorded, Severity, StartRun
 from coordinator.engine.stimuli import Begin, Point, Stimulus
-from coordinator.executor import Executor
+from coordinator.mission.executor import Executor
 from coordinator.net import Marking
-from coordinator.recording import PREPARED, SCORED, Step
+from coordinator.record.recording import PREPARED, SCORED, Step
 from coordinator.task import Status
 from services.comm.caller import Caller
 from services.comm.messages import Call, Outcome

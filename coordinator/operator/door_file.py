@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from coordinator.runfolder import DEFAULT, NoRunError, journal_of
+from coordinator.record.runfolder import DEFAULT, NoRunError, journal_of
 
 DOOR = "operator.json"
 

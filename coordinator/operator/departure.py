@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from coordinator.engine import Engine, Mode, Phase, Point, Run, Standing, State, point_from_plain, to_plain
-from coordinator.journal import Journal, JournalWriter
+from coordinator.experience.learning_session import fixed_by_user, session_of
 from coordinator.launch import Setting, lockstep_id
-from coordinator.learning_session import fixed_by_user, session_of
-from coordinator.partners import FirstAlternative, Observer
-from coordinator.recording import STIMULUS, JournalStore, clock_reading, replay
-from coordinator.runfolder import JOURNAL, header
+from coordinator.mission.partners import FirstAlternative, Observer
+from coordinator.record.journal import Journal, JournalWriter
+from coordinator.record.recording import STIMULUS, JournalStore, clock_reading, replay
+from coordinator.record.runfolder import JOURNAL, header
 from coordinator.task import Kind, Status, Task
 
 AGAIN = "again"

@@ -14,21 +14,21 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from coordinator.controls import Answer, Controls
-from coordinator.door_file import Door, door_open
 from coordinator.engine import Override, SetBreakpoints, Stimulus
+from coordinator.experience.learning_session import LearningSession
 from coordinator.hmi.feed import Feed
-from coordinator.learning_session import LearningSession
-from coordinator.mission import MissionError, Stage
-from coordinator.operation import Operation, Shell
-from coordinator.partners import FirstAlternative
-from coordinator.recording import JournalStore
-from coordinator.runfolder import RESULT
-from coordinator.start_order import learned_of
+from coordinator.mission.mission import MissionError, Stage
+from coordinator.mission.partners import FirstAlternative
+from coordinator.operator.controls import Answer, Controls
+from coordinator.operator.door_file import Door, door_open
+from coordinator.operator.operation import Operation, Shell
+from coordinator.operator.start_order import learned_of
+from coordinator.record.recording import JournalStore
+from coordinator.record.runfolder import RESULT
 
 
 class LedRun(ABC):
-    """Lead, finish. Fits `coordinator.station.Run`."""
+    """Lead, finish. Fits `coordinator.operator.station.Run`."""
 
     mode: str
     """realtime or lockstep."""

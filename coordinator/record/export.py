@@ -8,8 +8,8 @@ from datetime import UTC, datetime, timedelta
 from xml.sax.saxutils import quoteattr
 
 from coordinator.engine import Fired, RunRecorded, StartRun, to_plain
-from coordinator.journal import Journal
-from coordinator.recording import Step
+from coordinator.record.journal import Journal
+from coordinator.record.recording import Step
 
 
 def jsonl(journal: Journal, steps: Iterator[Step]) -> Iterator[str]:

@@ -6,7 +6,7 @@ file and services.toml, versions, seed. Numbers count up by one. A file that end
 fails its checksum, was torn by a crash: the tail is dropped and reported (also one of zeros, which a file system may leave after a
 power cut). One that cannot be read with whole records behind it is damage, not a crash, and is refused.
 
-Kinds of a mission run's journal: coordinator/recording.py. Why not SQLite: docs/decisions/journal.md has the measurement.
+Kinds of a mission run's journal: coordinator/record/recording.py. Why not SQLite: docs/decisions/journal.md has the measurement.
 """
 
 from __future__ import annotations

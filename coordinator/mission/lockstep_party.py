@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from coordinator.mission import Mission, Stage
+from coordinator.mission.mission import Mission, Stage
 from services.comm.directory import Directory
 from services.comm.messages import Call, Message, Refuse, Welcome
 from services.comm.party import Envelope

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from coordinator.engine import Fired, Instruction, Report, RunRecorded, StartRun
-from coordinator.journal import Journal
 from coordinator.net import Net
-from coordinator.recording import Step
+from coordinator.record.journal import Journal
+from coordinator.record.recording import Step
 
 _TEXT: Final = {"type": "string"}
 _NUMBER: Final = {"type": "number"}

@@ -13,8 +13,8 @@ from typing import Any, Protocol
 
 from coordinator.engine import Instruction, RunRecorded, State, Stimulus
 from coordinator.hmi.feed import Feed
-from coordinator.mission import Mission
-from coordinator.partners import FirstAlternative
+from coordinator.mission.mission import Mission
+from coordinator.mission.partners import FirstAlternative
 from coordinator.task import Task
 from services.comm.messages import Command
 from services.comm.notice import Progress

@@ -7,18 +7,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from coordinator.departure import departed_store, departing, departure
 from coordinator.engine import Engine
-from coordinator.estimates_file import EstimatesError
+from coordinator.experience.estimates_file import EstimatesError
 from coordinator.hmi.journals import task_of
-from coordinator.journal import JournalError, JournalWriter, read_journal
 from coordinator.launch import SCRIPTED, Setting, Substitutes, load_object, lockstep_id, mission_id, with_runs
-from coordinator.mission_run import MissionRun
-from coordinator.partners import FirstAlternative
-from coordinator.recording import JournalStore, ReplayError, clock_reading
-from coordinator.runfolder import JOURNAL, header
-from coordinator.simulated_run import SimulatedRun
-from coordinator.start_order import StartOrder, read_depart
+from coordinator.mission.partners import FirstAlternative
+from coordinator.operator.departure import departed_store, departing, departure
+from coordinator.operator.mission_run import MissionRun
+from coordinator.operator.simulated_run import SimulatedRun
+from coordinator.operator.start_order import StartOrder, read_depart
+from coordinator.record.journal import JournalError, JournalWriter, read_journal
+from coordinator.record.recording import JournalStore, ReplayError, clock_reading
+from coordinator.record.runfolder import JOURNAL, header
 from coordinator.task import Task
 from coordinator.taskfile import TaskFileError
 from services.comm.directory import Directory, DirectoryError, parse

@@ -11,15 +11,15 @@ import asyncio
 import shutil
 import time
 
-from coordinator.departure import Departure
 from coordinator.engine import Mode
+from coordinator.experience.learning_session import LearningSession
 from coordinator.hmi.feed import Feed
 from coordinator.launch import Setting, Substitutes, lockstep_cell
-from coordinator.learning_session import LearningSession
-from coordinator.led_run import LedRun
-from coordinator.lockstep_party import CoordinatorParty
-from coordinator.partners import FirstAlternative
-from coordinator.recording import JournalStore
+from coordinator.mission.lockstep_party import CoordinatorParty
+from coordinator.mission.partners import FirstAlternative
+from coordinator.operator.departure import Departure
+from coordinator.operator.led_run import LedRun
+from coordinator.record.recording import JournalStore
 from services.comm.cell import Cell
 from services.comm.directory import Directory
 
@@ -32,7 +32,7 @@ AHEAD = 0.01
 
 
 class SimulatedShell:
-    """Ticks of a cell at a pace; what `coordinator.operation.Operation` drives in place of a mission in real time."""
+    """Ticks of a cell at a pace; what `coordinator.operator.operation.Operation` drives in place of a mission in real time."""
 
     def __init__(self, cell: Cell, party: CoordinatorParty, pace: float) -> None:
         self.mission = party.mission
@@ -95,7 +95,7 @@ class SimulatedShell:
 
 
 class SimulatedRun(LedRun):
-    """Prepare, lead, finish. Fits `coordinator.station.Run`."""
+    """Prepare, lead, finish. Fits `coordinator.operator.station.Run`."""
 
     mode = "lockstep"
 
