@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import shutil
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+import socket
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,9 +20,11 @@ from coordinator.hmi.server import Page, start_page
 from coordinator.task import Executed, Status
 from coordinator.taskfile import load
 from tests.hmi.stage import Part, Stage
+from tests.waiting import beat
 
 if TYPE_CHECKING:
-    from playwright.async_api import Browser
+    from playwright.async_api import Browser, ConsoleMessage, Locator
+    from playwright.async_api import Page as Tab
 
 HERE = Path(__file__).parent
 BROWSER = Path(os.environ.get("PETROBOT_BROWSER", "/usr/bin/chromium"))
@@ -33,6 +37,7 @@ ARGUMENTS = [
     "--disable-component-update",
     "--disable-sync",
 ]
+PATIENCE_MS = 60_000  # for a condition: a browser beside other tests on two slow cores is late now and then
 SLIPPED = Part(0.3, Status.ERROR, "slipped", "the part slipped out of the gripper", Executed.YES)
 SCRIPT = {
     "look__edges": [Part(0.3)],
@@ -109,10 +114,61 @@ def faults() -> Callable[[Any], list[str]]:
     def watch(tab: Any) -> list[str]:
         found: list[str] = []
         tab.on("pageerror", lambda error: found.append(f"script error: {error}"))
-        tab.on("console", lambda message: found.append(message.text) if message.type == "error" else None)
+        tab.on("console", lambda message: found.append(message.text) if is_fault(message) else None)
         return found
 
     return watch
+
+
+def is_fault(message: ConsoleMessage) -> bool:
+    """Whether the page complains; a net that cannot be analysed yet is answered so, which the browser notes (422)."""
+    return message.type == "error" and "422" not in message.text
+
+
+async def until(holds: Callable[[], bool]) -> None:
+    """Wait until something holds on this side of the wire."""
+    async with asyncio.timeout(PATIENCE_MS / 1000):
+        while not holds():
+            await beat()
+
+
+NOTE_TOASTS = """() => {
+  window.toasted = [...document.querySelectorAll(".toast")].map((toast) => toast.title);
+  const note = (changes) => changes.forEach(({ addedNodes }) => addedNodes.forEach((toast) => window.toasted.push(toast.title)));
+  new MutationObserver(note).observe(document.querySelector(".toasts"), { childList: true });
+}"""
+
+
+async def note_toasts(tab: Tab) -> None:
+    """Keep what the page says for a few seconds only: whoever looks once a second may be too late."""
+    await tab.evaluate(NOTE_TOASTS)
+
+
+async def toasted(tab: Tab, pattern: str) -> None:
+    """Wait until the page has said something like that since `note_toasts`."""
+    script = "(pattern) => window.toasted.some((said) => new RegExp(pattern).test(said))"
+    await tab.wait_for_function(script, arg=pattern)
+
+
+PRESS_TWICE = "(button) => { button.click(); const asked = button.textContent; button.click(); return asked; }"
+
+
+async def abort(toolbar: Locator) -> None:
+    """Press Abort, which asks, and press it again: in one go, as the page takes the answer for three seconds only."""
+    from playwright.async_api import expect
+
+    button = toolbar.get_by_role("button", name="Abort")
+    await expect(button).to_be_enabled()
+    assert await button.evaluate(PRESS_TWICE) == "Abort the mission?"
+
+
+@contextmanager
+def nobody_listens(port: int) -> Iterator[None]:
+    """Keep a port that has just been left from being given to anybody else; it may be listened on again meanwhile."""
+    with socket.socket() as placeholder:
+        placeholder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        placeholder.bind(("127.0.0.1", port))
+        yield
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")

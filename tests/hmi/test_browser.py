@@ -6,6 +6,7 @@ import asyncio
 import os
 import re
 from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,17 @@ from coordinator.hmi.sessions import Session
 from coordinator.task import Executed, Status
 from coordinator.taskfile import load
 from tests.bench.hmi import SyntheticMission, ticking
-from tests.hmi.conftest import browser_missing, served, staged
+from tests.hmi.conftest import (
+    PATIENCE_MS,
+    abort,
+    browser_missing,
+    nobody_listens,
+    note_toasts,
+    served,
+    staged,
+    toasted,
+    until,
+)
 from tests.hmi.stage import Part, Stage
 from tests.hmi.test_changes import changes
 
@@ -33,7 +44,6 @@ from playwright.async_api import Page as Tab
 pytestmark = [pytest.mark.asyncio(loop_scope="module"), pytest.mark.usefixtures("_windows_are_closed")]
 Watch = Callable[[Any], list[str]]
 SIZE = {"width": 1440, "height": 900}
-PATIENCE_MS = 20_000  # a browser beside other tests on two cores is late now and then
 expect.set_options(timeout=PATIENCE_MS)
 
 
@@ -58,7 +68,20 @@ async def opened(browser: Browser, page: Page, theme: str = "light") -> Tab:
     tab = await context.new_page()
     await tab.goto(page.url)
     await expect(tab.get_by_role("button", name="Emergency stop")).to_be_visible()
+    await note_toasts(tab)
     return tab
+
+
+async def settled(tab: Tab) -> None:
+    """The designer has opened what it was asked to open: nothing moves there any more by itself."""
+    await expect(tab.locator(".designer")).not_to_have_attribute("aria-busy", "true")
+
+
+async def checked(tab: Tab, said: str = "May run") -> None:
+    """The server has checked what is drawn now, and says so; before, the list says what was found in what was drawn then."""
+    findings = tab.get_by_role("region", name="Findings")
+    await expect(findings).not_to_have_attribute("aria-busy", "true")
+    await expect(findings).to_contain_text(said)
 
 
 def element(tab: Tab, name: str, canvas: str = "Drawing of the task") -> Locator:
@@ -121,9 +144,10 @@ async def test_a_new_user_draws_runs_and_understands(
     tab = await opened(browser, page)
     complaints = faults(tab)
     await tab.get_by_role("tab", name="Design").click()
+    await settled(tab)
     await tab.get_by_role("button", name="New task").click()
     await draw_the_task(tab)
-    await expect(tab.get_by_role("region", name="Findings")).to_contain_text("May run")
+    await checked(tab)
     await tab.screenshot(path=shots / "designer.png")
 
     await take_controls(tab)
@@ -138,12 +162,18 @@ async def test_a_new_user_draws_runs_and_understands(
     assert complaints == []
 
 
+async def hold_controls(tab: Tab) -> None:
+    """Take the controls, and wait until one holds them."""
+    await tab.get_by_role("button", name="Take controls").click()
+    await expect(tab.get_by_role("toolbar", name="Mission")).to_contain_text("You hold the controls")
+
+
 async def take_controls(tab: Tab) -> None:
     """Take the controls on the live view and come back."""
     await tab.get_by_role("tab", name="Live").click()
-    await tab.get_by_role("button", name="Take controls").click()
-    await expect(tab.get_by_text("You hold the controls").first).to_be_visible()
+    await hold_controls(tab)
     await tab.get_by_role("tab", name="Design").click()
+    await settled(tab)
 
 
 async def draw_the_task(tab: Tab) -> None:
@@ -184,6 +214,7 @@ async def run_it_by_hand(tab: Tab, stage: Stage, shots: Path) -> None:
     stage.kept.clear()
     await toolbar.get_by_role("button", name="Step").click()
     await expect(tab.get_by_role("region", name="Last firings").get_by_role("listitem")).to_have_count(before + 1)
+    await expect(toolbar).to_contain_text("Paused after one firing")
     await expect(mission).to_contain_text("Paused")
     assert stage.state.firings == before + 1
     await element(tab, "^Control place jobs", "Task net").click()
@@ -191,7 +222,7 @@ async def run_it_by_hand(tab: Tab, stage: Stage, shots: Path) -> None:
     await expect(element(tab, "^Control place jobs, 2 tokens", "Task net")).to_be_visible()
     await tab.screenshot(path=shots / "paused.png")
     await toolbar.get_by_role("button", name="Resume").click()
-    await expect(mission).to_contain_text("Success", timeout=15_000)
+    await expect(mission).to_contain_text("Success")
     why = tab.get_by_role("region", name="Last firings").get_by_role("listitem").filter(has_text="slipped")
     await expect(why).to_contain_text("pick on arm: the part slipped out of the gripper")
     await why.get_by_role("button").click()
@@ -204,7 +235,7 @@ async def run_it_by_hand(tab: Tab, stage: Stage, shots: Path) -> None:
 
 async def start_mission(tab: Tab, task: str = "") -> None:
     """Take the controls and start."""
-    await tab.get_by_role("button", name="Take controls").click()
+    await hold_controls(tab)
     await tab.get_by_role("toolbar", name="Mission").get_by_role("button", name="Start").click()
     await expect(tab.get_by_role("status", name="Mission state")).to_contain_text("Running")
 
@@ -231,11 +262,13 @@ async def test_two_operators(browser: Browser, page: Page, stage: Stage) -> None
 async def test_operators_hand_on_the_net(browser: Browser, page: Page, stage: Stage) -> None:
     """Raise an event, stop at a breakpoint set beforehand, choose the alternative, force a way out, abort."""
     stage.script["pick"].clear()
-    stage.script["pick"].append(Part(30.0))
+    stage.script["pick"].append(Part(0.3))
+    stage.kept.update({"look__template", "pick", "put"})
     tab = await opened(browser, page)
-    await tab.get_by_role("button", name="Take controls").click()
+    await hold_controls(tab)
     await element(tab, "^Transition picked", "Task net").click()
     await tab.get_by_role("button", name="Set breakpoint").click()
+    await expect(tab.get_by_role("button", name="Remove breakpoint")).to_be_visible()
     await tab.get_by_label("Alternative for look").select_option("look__template")
     await tab.get_by_role("toolbar", name="Mission").get_by_role("button", name="Start").click()
     await element(tab, "^Transition begin", "Task net").click()
@@ -244,12 +277,12 @@ async def test_operators_hand_on_the_net(browser: Browser, page: Page, stage: St
     running = tab.get_by_role("region", name="Running now")
     await expect(running).to_contain_text("look template")
     await expect(running).to_contain_text("for look: operator")
+    stage.kept.remove("look__template")
     await expect(running).to_contain_text("pick")
     await element(tab, "^Action place pick", "Task net").click()
     await tab.get_by_role("button", name="Force picked").click()
     await expect(running).to_contain_text("put")
-    await tab.get_by_role("button", name="Abort").click()
-    await tab.get_by_role("button", name="Abort the mission?").click()
+    await abort(tab.get_by_role("toolbar", name="Mission"))
     await expect(tab.get_by_role("status", name="Mission state")).to_contain_text("Aborted")
     verbs = [verb for _, verb, _ in stage.commands]
     assert verbs == [
@@ -259,8 +292,7 @@ async def test_operators_hand_on_the_net(browser: Browser, page: Page, stage: St
 
 async def test_a_folded_error_branch_turns_red(browser: Browser, page: Page, stage: Stage, shots: Path) -> None:
     """Error branches are hidden behind a badge until a token enters one; a press shows them."""
-    stage.script["clear"].clear()
-    stage.script["clear"].append(Part(30.0))
+    stage.kept.add("clear")
     tab = await opened(browser, page, "dark")
     await expect(element(tab, "^Action place clear", "Task net")).to_be_hidden()
     await start_mission(tab)
@@ -288,7 +320,7 @@ async def test_script_in_names_and_reasons_is_text(browser: Browser, page: Page,
     stage.where["pick"] = EVIL
     tab = await opened(browser, page)
     complaints = faults(tab)
-    await tab.get_by_role("button", name="Take controls").click()
+    await hold_controls(tab)
     for operator in ("ana", EVIL):
         await stage.command(operator, "ask_controls", {})
     holder = stage.controls.holder
@@ -302,7 +334,8 @@ async def test_script_in_names_and_reasons_is_text(browser: Browser, page: Page,
     await expect(tab.get_by_role("tabpanel", name="Variables")).to_contain_text("<script>")
     await tab.get_by_role("tab", name="Design").click()
     await tab.get_by_label("Task", exact=True).select_option("evil")
-    await expect(tab.get_by_label("Name", exact=True)).to_be_visible()
+    await expect(tab.locator(".designer .net .label", has_text="<img src=x")).to_have_count(1)
+    await settled(tab)
     assert await tab.title() == "petrobot"
     assert await tab.locator("img[src=x]").count() == 0
     assert await tab.locator("body script").count() == 0
@@ -322,11 +355,12 @@ async def test_a_lost_connection_is_plain_to_see(
         tab = await opened(browser, first)
         port = int(first.url.rpartition(":")[2].partition("/")[0])
         await expect(tab.get_by_role("button", name="Take controls")).to_be_visible()
-    await expect(tab.get_by_role("alert")).to_contain_text("Connection to the coordinator lost")
-    stage.feed.emit("marking", marking={"parts": 7})
-    again = await start_page(stage, tasks_folder=tasks, port=port, token="open sesame")
+    with nobody_listens(port):
+        await expect(tab.get_by_role("alert")).to_contain_text("Connection to the coordinator lost")
+        stage.feed.emit("marking", marking={"parts": 7})
+        again = await start_page(stage, tasks_folder=tasks, port=port, token="open sesame")
     try:
-        await expect(tab.get_by_role("alert")).to_be_hidden(timeout=10_000)
+        await expect(tab.get_by_role("alert")).to_be_hidden()
         await expect(element(tab, "^Control place parts, 7 tokens", "Task net")).to_be_visible()
     finally:
         await again.close()
@@ -388,6 +422,12 @@ async def test_details(browser: Browser, page: Page, stage: Stage, shots: Path, 
     assert complaints == []
 
 
+def mission_of(stage: Stage) -> tuple[str, str]:
+    """Which mission there is, and how it stands."""
+    mission = stage.feed.state["mission"]
+    return mission["id"], mission["state"]
+
+
 async def test_history(browser: Browser, page: Page, stage: Stage, shots: Path, faults: Watch) -> None:
     """Scrub a finished run forwards and backwards, jump to its error, compare it with another, start one from a point."""
     tab = await opened(browser, page)
@@ -395,11 +435,12 @@ async def test_history(browser: Browser, page: Page, stage: Stage, shots: Path, 
     stage.on_beat.append(
         lambda _: None if stage.feed.state["events"]["part_there"]["armed"] else stage.happen("part_there")
     )
-    await tab.get_by_role("button", name="Take controls").click()
-    for _ in range(2):
+    await hold_controls(tab)
+    for run in ("pick_and_place-2", "pick_and_place-3"):
         await tab.get_by_role("toolbar", name="Mission").get_by_role("button", name="Start").click()
-        await expect(tab.get_by_role("status", name="Mission state")).to_contain_text("Running")
-        await expect(tab.get_by_role("status", name="Mission state")).to_contain_text("Success", timeout=15_000)
+        await until(lambda run=run: mission_of(stage) == (run, "success"))  # type: ignore[misc]
+        await expect(tab.locator("html")).to_have_attribute("data-sequence", str(stage.feed.state["sequence"]))
+        await expect(tab.get_by_role("status", name="Mission state")).to_contain_text("Success")
     await tab.get_by_role("tab", name="History").click()
     runs = tab.get_by_role("navigation", name="Runs")
     await runs.get_by_role("button", name="pick_and_place-2", exact=False).first.click()
@@ -437,7 +478,8 @@ async def designer(browser: Browser, page: Page) -> Tab:
     """The designer with the shipped task open."""
     tab = await opened(browser, page)
     await tab.get_by_role("tab", name="Design").click()
-    await expect(tab.get_by_role("region", name="Findings")).to_contain_text("May run")
+    await settled(tab)
+    await checked(tab)
     return tab
 
 
@@ -461,11 +503,13 @@ async def test_drawing_by_keyboard_alone(browser: Browser, page: Page, faults: W
         await tab.keyboard.press("Enter")
         await expect(drawing.get_by_role("button", name=f"Arc from {start} to {target}")).to_have_count(1)
     await select_by_keyboard(tab, "work")
-    before = await element(tab, "^Action place work").get_attribute("transform")
+    work = element(tab, "^Action place work")
+    before = await work.get_attribute("transform")
+    assert before
     await tab.keyboard.press("ArrowRight")
-    assert await element(tab, "^Action place work").get_attribute("transform") != before
+    await expect(work).not_to_have_attribute("transform", before)
     await tab.keyboard.press("Control+z")
-    assert await element(tab, "^Action place work").get_attribute("transform") == before
+    await expect(work).to_have_attribute("transform", before)
     await tab.keyboard.press("Control+a")
     await tab.keyboard.press("Control+c")
     await tab.keyboard.press("Control+v")
@@ -517,8 +561,8 @@ async def test_a_late_answer_takes_nothing_away(browser: Browser, page: Page, ta
         await tab.get_by_role("tab", name="Design").click()
     await tab.get_by_role("button", name="New task").click()
     await draw_place(tab, "Control place", "jobs", 0.3, 0.3)
-    async with tab.expect_response("**/api/tasks/*"):
-        opening.set()
+    opening.set()
+    await settled(tab)
     await draw_place(tab, "Resource place", "arm_free", 0.5, 0.6)
     drawing = tab.get_by_role("application", name="Drawing of the task")
     await expect(drawing.get_by_role("button", name=re.compile(" place "))).to_have_count(2)
@@ -531,10 +575,60 @@ async def test_a_late_answer_takes_nothing_away(browser: Browser, page: Page, ta
         await dialog.get_by_role("button", name="OK").click()
     await draw_place(tab, "Control place", "more", 0.7, 0.3)
     saving.set()
+    await toasted(tab, "^Saved$")
+    await expect(tab.get_by_label("Task", exact=True)).to_have_value("late")
     await expect(tab.get_by_role("status").filter(has_text=re.compile("^not saved$"))).to_be_visible()
     await expect(element(tab, "^Control place more")).to_be_visible()
-    await expect(tab.get_by_text("Saved", exact=True)).to_be_visible()
     assert set(load(tasks / "late.toml").places) == {"jobs", "arm_free"}
+
+
+async def test_what_is_typed_while_the_page_loads_stays(browser: Browser, page: Page) -> None:
+    """Offers that come in late do not draw the form anew under the hands of whoever types already."""
+    tab = await opened(browser, page)
+    offers = await late(tab, "**/api/offers", "GET")
+    await tab.get_by_role("tab", name="Design").click()
+    await tab.get_by_role("button", name="New task").click()
+    goal = tab.get_by_label("Goal", exact=True)
+    await goal.fill("typed early")
+    offers.set()
+    await settled(tab)
+    await expect(goal).to_be_focused()
+    await goal.press("Enter")
+    await expect(goal).to_have_value("typed early")
+    await expect(tab.locator(".saved")).to_have_text("not saved")
+
+
+async def test_a_press_is_not_lost_to_what_comes_in_meanwhile(browser: Browser, page: Page, stage: Stage) -> None:
+    """Between press and release offers, findings and tokens come in: the form under the pointer waits, and the press counts."""
+    tab = await designer(browser, page)
+    await element(tab, "^Transition pick_failed").click()
+    await tab.keyboard.press("Delete")
+    await checked(tab, "fault")
+    await element(tab, "^Action place pick").click()
+    async with pressed(tab, "Add error branch"), tab.expect_response("**/api/check"):
+        stage.feed.emit("node", name="scale", node={"state": "up", "round_trip": 0.001})
+    await expect(element(tab, "^Transition pick_error")).to_be_visible()
+
+    await tab.get_by_role("tab", name="Live").click()
+    await hold_controls(tab)
+    await element(tab, "^Control place parts", "Task net").click()
+    selected = tab.get_by_role("region", name="Selected")
+    async with pressed(tab, "Set breakpoint"):
+        stage.feed.emit("marking", marking={"parts": 1})
+        await expect(element(tab, "^Control place parts, 1 token", "Task net")).to_be_visible()
+        await tab.evaluate("petrobot.tabs.Live.paintText()")
+    await until(lambda: "parts" in stage.state.breakpoints)
+    await expect(selected.get_by_role("button", name="Remove breakpoint")).to_be_visible()
+    await expect(selected).to_contain_text("1 of")
+
+
+@asynccontextmanager
+async def pressed(tab: Tab, button: str) -> AsyncIterator[None]:
+    """Hold a button down with the mouse for so long."""
+    await tab.get_by_role("button", name=button).hover()
+    await tab.mouse.down()
+    yield
+    await tab.mouse.up()
 
 
 async def test_what_may_not_be_drawn_says_why(browser: Browser, page: Page) -> None:
@@ -543,7 +637,7 @@ async def test_what_may_not_be_drawn_says_why(browser: Browser, page: Page) -> N
     await tab.get_by_role("toolbar", name="Drawing tools").get_by_role("button", name="Arc", exact=True).click()
     await element(tab, "^Action place look").click()
     await element(tab, "^Action place pick").click()
-    await expect(tab.get_by_text("never two places")).to_be_visible()
+    await toasted(tab, "never two places")
     await tab.keyboard.press("Escape")
     await element(tab, "^Transition pick_failed").click()
     await tab.keyboard.press("Delete")
@@ -610,14 +704,14 @@ async def test_macro_places_open_in_both_views(browser: Browser, page: Page, sta
         '\n[subnets.fetching]\nentry = "inside"\nnormal = "handed"\n'
         '[subnets.fetching.places.inside]\nkind = "control"\nx = 80\ny = 100\n'
         '[subnets.fetching.places.handed]\nkind = "control"\nx = 300\ny = 100\n'
-        '[subnets.fetching.transitions.pass_on]\nin = ["inside"]\nout = ["handed"]\nafter = 60.0\nx = 190\ny = 100\n'
+        '[subnets.fetching.transitions.pass_on]\nin = ["inside"]\nout = ["handed"]\nafter = 3600.0\nx = 190\ny = 100\n'
         '\n[places.fetch]\nkind = "macro"\nsubnet = "fetching"\nx = 120\ny = 440\n'
         '[transitions.leave]\nin = ["fetch:normal"]\nout = ["arm_free"]\nx = 200\ny = 380\n'
     )
     (tasks / "nested.toml").write_text(text.replace('out = ["look"]', 'out = ["fetch"]') + inner)
     stage.load(load(tasks / "nested.toml"), (tasks / "nested.toml").read_text())
     tab = await opened(browser, page)
-    await tab.get_by_role("button", name="Take controls").click()
+    await hold_controls(tab)
     holder = stage.controls.holder
     assert holder is not None
     assert (await stage.command(holder, "start", {"task": "nested"}))["ok"]
@@ -630,6 +724,7 @@ async def test_macro_places_open_in_both_views(browser: Browser, page: Page, sta
     await expect(element(tab, "^Macro place fetch", "Task net")).to_be_visible()
     await tab.get_by_role("tab", name="Design").click()
     await tab.get_by_label("Task", exact=True).select_option("nested")
+    await settled(tab)
     await element(tab, "^Macro place fetch").click()
     await tab.get_by_role("complementary", name="Properties").get_by_role("button", name="Open").click()
     await expect(element(tab, "^Control place inside")).to_be_visible()
@@ -674,10 +769,12 @@ async def test_fifty_updates_a_second_leave_no_gap(browser: Browser, page: Page,
     await expect(element(tab, "^Transition step_49", "Task net")).to_be_visible()
     mission.feed = stage.feed
     await ticking(mission, 2.0)
+    async with asyncio.timeout(PATIENCE_MS / 1000):
+        while await tab.evaluate("petrobot.link.deltas") <= 10:  # a starved browser gets them in few heaps
+            await ticking(mission, 0.5)
     last = str(stage.feed.state["sequence"])
     await expect(tab.locator("html")).to_have_attribute("data-sequence", last)
     assert await tab.evaluate("petrobot.link.gaps") == 0
-    assert await tab.evaluate("petrobot.link.deltas") > 10
 
 
 async def test_the_stop_is_within_reach_of_every_dialog(browser: Browser, page: Page, stage: Stage) -> None:
@@ -688,10 +785,11 @@ async def test_the_stop_is_within_reach_of_every_dialog(browser: Browser, page: 
     await expect(dialog).to_be_visible()
     await tab.get_by_role("button", name="Emergency stop").click()
     await tab.keyboard.press("F9")
-    await expect(tab.get_by_text("Emergency stop given")).to_be_visible()
+    await toasted(tab, "Emergency stop given")
     await dialog.get_by_role("button", name="Close").focus()
     await tab.keyboard.press("Escape")
     await expect(dialog).to_be_hidden()
+    await until(lambda: len(stage.commands) > 1)
     assert [verb for _, verb, _ in stage.commands] == ["estop", "estop"]
 
 

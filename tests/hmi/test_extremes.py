@@ -12,7 +12,7 @@ import pytest
 import pytest_asyncio
 
 from coordinator.hmi.server import Page
-from tests.hmi.conftest import browser_missing, served, staged
+from tests.hmi.conftest import PATIENCE_MS, browser_missing, served, staged
 from tests.hmi.stage import Stage
 
 if browser_missing() and os.environ.get("CI") != "true":
@@ -21,7 +21,7 @@ if browser_missing() and os.environ.get("CI") != "true":
 from playwright.async_api import Browser, expect
 from playwright.async_api import Page as Tab
 
-from tests.hmi.test_browser import PATIENCE_MS, Watch
+from tests.hmi.test_browser import Watch
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 LONG = ("a_name_that_somebody_wrote_down_without_any_thought_of_screens_or_of_readers_" * 2)[:80]

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 import pytest_asyncio
 
-from tests.hmi.conftest import browser_missing
+from tests.hmi.conftest import PATIENCE_MS, abort, browser_missing, note_toasts, toasted
 
 if browser_missing() and os.environ.get("CI") != "true":
     pytest.skip(browser_missing(), allow_module_level=True)
@@ -24,7 +24,7 @@ if browser_missing() and os.environ.get("CI") != "true":
 from playwright.async_api import Browser, expect
 from playwright.async_api import Page as Tab
 
-from tests.hmi.test_browser import PATIENCE_MS, SIZE, Watch, draw_the_task, element
+from tests.hmi.test_browser import SIZE, Watch, checked, draw_the_task, element, hold_controls, settled
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 ROOT = Path(__file__).parents[2]
@@ -51,8 +51,12 @@ node = "arm"
 """
 SCRIPT = """\
 schema = 1
-[actions.look_at_table]
-seconds = 1.5
+[[actions.look_at_table]]
+seconds = 5.0
+[[actions.look_at_table]]
+seconds = 0.3
+[[actions.look_at_table]]
+seconds = 0.3
 [[actions.pick_part]]
 status = "error"
 cause = "slipped"
@@ -75,7 +79,7 @@ class Served:
         """Ctrl-C; its exit code."""
         if self.process.returncode is None:
             self.process.send_signal(signal.SIGINT)
-        async with asyncio.timeout(30):
+        async with asyncio.timeout(120):
             return await self.process.wait()
 
 
@@ -97,7 +101,7 @@ async def serving(folder: Path) -> AsyncIterator[Served]:
         stdout=asyncio.subprocess.PIPE,
     )
     assert process.stdout is not None
-    async with asyncio.timeout(60):
+    async with asyncio.timeout(120):
         line = (await process.stdout.readline()).decode()
     served = Served(process, line.removeprefix("page: ").strip(), folder)
     try:
@@ -121,6 +125,7 @@ async def window(browser: Browser, served: Served, theme: str = "light") -> Asyn
     tab = await context.new_page()
     await tab.goto(served.url)
     await expect(tab.get_by_role("button", name="Emergency stop")).to_be_visible()
+    await note_toasts(tab)
     yield tab
     await context.close()
 
@@ -132,12 +137,13 @@ async def test_a_new_user_draws_a_task_and_runs_it_on_the_cell(
     async with window(browser, served) as tab:
         complaints = faults(tab)
         await expect(tab.get_by_role("region", name="Nodes")).to_contain_text("2 of 2 up")
-        await tab.get_by_role("button", name="Take controls").click()
+        await hold_controls(tab)
         await tab.screenshot(path=shots / "serve-idle.png")
         await tab.get_by_role("tab", name="Design").click()
+        await settled(tab)
         await tab.get_by_role("button", name="New task").click()
         await draw_the_task(tab)
-        await expect(tab.get_by_role("region", name="Findings")).to_contain_text("May run")
+        await checked(tab)
         await tab.get_by_role("button", name="Run this task").click()
         dialog = tab.get_by_role("dialog", name="Save the task as")
         await dialog.get_by_label("Name").fill("drawn")
@@ -168,7 +174,7 @@ async def lead_by_hand(tab: Tab, shots: Path) -> None:
     await tab.screenshot(path=shots / "serve-paused.png")
     await toolbar.get_by_role("button", name="Step").click()
     await expect(fired).to_have_count(2)
-    await expect(mission).to_contain_text("Paused")
+    await expect(toolbar).to_contain_text("Paused after one firing")
     await toolbar.get_by_role("button", name="Resume").click()
     await expect(mission).to_contain_text("Success")
     why = fired.filter(has_text="slipped").first
@@ -190,8 +196,7 @@ async def start_again(tab: Tab, shots: Path) -> None:
     await tab.get_by_role("button", name="Set breakpoint").click()
     await toolbar.get_by_role("button", name="Start", exact=True).click()
     await expect(mission).to_contain_text("Paused")
-    await toolbar.get_by_role("button", name="Abort").click()
-    await toolbar.get_by_role("button", name="Abort the mission?").click()
+    await abort(toolbar)
     await expect(mission).to_contain_text("Aborted")
 
 
@@ -214,9 +219,10 @@ async def test_what_cannot_start_says_why_on_the_page(browser: Browser, served: 
         await toolbar.get_by_label("Task to start").select_option("catch_ball")
         await expect(element(tab, "^Action place locate_ball", "Task net")).to_be_visible()
         await toolbar.get_by_role("button", name="Start", exact=True).click()
-        await expect(tab.get_by_text(re.compile("catch_ball may not run.*no node offers")).first).to_be_visible()
+        await toasted(tab, "catch_ball may not run.*no node offers")
         await tab.screenshot(path=shots / "serve-refused.png")
         await tab.get_by_role("tab", name="Design").click()
+        await settled(tab)
         await expect(tab.get_by_text("shipped, saving makes your copy")).to_be_visible()
         await tab.get_by_label("Goal", exact=True).fill("mine")
         await tab.get_by_label("Goal", exact=True).press("Enter")

@@ -14,7 +14,7 @@ from coordinator.hmi.journals import JournalHistory
 from coordinator.hmi.server import Page, start_page
 from coordinator.record.journal import read_journal
 from coordinator.record.runfolder import JOURNAL
-from tests.hmi.conftest import browser_missing
+from tests.hmi.conftest import PATIENCE_MS, browser_missing
 from tests.station.conftest import TASK
 from tests.station.test_starting import REMARKED, Simulated
 
@@ -24,7 +24,7 @@ if browser_missing() and os.environ.get("CI") != "true":
 from playwright.async_api import Browser, Locator, expect
 from playwright.async_api import Page as Tab
 
-from tests.hmi.test_browser import PATIENCE_MS, Watch, element, opened
+from tests.hmi.test_browser import Watch, element, hold_controls, opened
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 expect.set_options(timeout=PATIENCE_MS)
@@ -57,7 +57,7 @@ def mission(tab: Tab) -> Locator:
 
 async def chosen(tab: Tab, task: str) -> Locator:
     """Hold the controls and have the start form of a task open."""
-    await tab.get_by_role("button", name="Take controls").click()
+    await hold_controls(tab)
     toolbar = tab.get_by_role("toolbar", name="Mission")
     await toolbar.get_by_label("Task to start").select_option(task)
     await toolbar.get_by_role("button", name="Start with").click()
@@ -152,10 +152,12 @@ async def test_the_selector_is_overridden_and_frozen_from_the_page(
     await dialog.get_by_role("button", name="Start").click()
     await expect(mission(tab)).to_contain_text("Paused")
     await tab.get_by_label("Alternative for look").select_option("look twice")
-    await tab.get_by_role("toolbar", name="Mission").get_by_role("button", name="Step").click()
+    toolbar = tab.get_by_role("toolbar", name="Mission")
+    await toolbar.get_by_role("button", name="Step").click()
+    await expect(toolbar).to_contain_text("Paused after one firing")
     selected = tab.get_by_role("region", name="Selected")
     await tab.get_by_role("button", name="Remove breakpoint").click()
-    await tab.get_by_role("toolbar", name="Mission").get_by_role("button", name="Resume").click()
+    await toolbar.get_by_role("button", name="Resume").click()
     await expect(mission(tab)).to_contain_text("Success")
     await expect(selected).to_be_visible()
     reasons = {run["why"] for run in cell.state["ended"] if run["place"] == "look"}
@@ -187,6 +189,7 @@ async def test_a_run_sets_out_from_a_point_of_another(
     await tab.get_by_role("button", name="Take controls").click()
     await tab.get_by_role("tab", name="History").click()
     await tab.get_by_role("navigation", name="Runs").get_by_role("button", name=re.compile(f"^{first}")).click()
+    await expect(tab.locator(".history")).not_to_have_attribute("aria-busy", "true")
     await tab.get_by_role("button", name="First record").click()
     await tab.get_by_role("button", name="Next record").click()
     await here.click()
@@ -196,8 +199,8 @@ async def test_a_run_sets_out_from_a_point_of_another(
     await tab.screenshot(path=shots / "simulate-from.png")
     await dialog.get_by_role("button", name="Simulate").click()
     await expect(tab.get_by_role("tab", name="Live")).to_have_attribute("aria-selected", "true")
-    await expect(mission(tab)).to_contain_text("Success")
     await expect(mission(tab)).to_contain_text("from record")
+    await expect(mission(tab)).to_contain_text("Success")
     made = cell.state["mission"]["id"]
     source = read_journal(cell.runs / made / JOURNAL).header["from"]
     assert (source["run"], source["going"]) == (first, {"look": "error"})
@@ -233,12 +236,14 @@ async def test_the_emergency_stop_is_cleared_by_who_holds_the_controls(
     await expect(mission(ana)).to_contain_text("Emergency stop")
     clear = ana.get_by_role("button", name="Clear the stop")
     await clear.focus()
+    await expect(clear).to_be_focused()
     await ana.keyboard.press("Enter")
     question = ana.get_by_role("dialog", name="Clear the emergency stop?")
     await expect(question).to_contain_text("emergency stop by")
     await ana.screenshot(path=shots / "clear-stop.png")
     await ana.keyboard.press("Escape")
     await expect(question).to_be_hidden()
+    await expect(clear).to_be_focused()
     await expect(mission(ana)).to_contain_text("Emergency stop")
     await ana.keyboard.press("Enter")
     await question.get_by_role("button", name="Clear the stop").press("Enter")

@@ -72,6 +72,45 @@ export function rows(parent, items, key, make, update) {
   }
 }
 
+/** Whether something in a part of the page is pressed just now: a button that is replaced before its release swallows the press. */
+export class Press {
+  constructor(root) {
+    Object.assign(this, { number: 0, going: 0, later: null });
+    root.addEventListener("pointerdown", (event) => this.begin(event));
+    root.addEventListener("click", () => this.end(this.going), { capture: true }); // what the press itself alters is shown at once
+    for (const kind of ["pointerup", "pointercancel"]) addEventListener(kind, () => this.released(this.going), { capture: true });
+  }
+
+  begin(event) {
+    const pressed = event.button === 0 && event.target.closest("button, label") && !event.target.closest("select");
+    if (pressed) this.going = ++this.number;
+  }
+
+  /** The click that belongs to a release comes before anything else. */
+  released(press) {
+    if (press) setTimeout(() => this.end(press));
+  }
+
+  end(press) {
+    if (!press || press !== this.going) return;
+    this.going = 0;
+    setTimeout(() => this.draw());
+  }
+
+  /** True while a press goes on: `draw` is then called as soon as it is over, the last one that was asked for. */
+  holds(draw) {
+    this.later = this.going ? draw : null;
+    return Boolean(this.going);
+  }
+
+  draw() {
+    const { later } = this;
+    if (this.going || !later) return;
+    this.later = null;
+    later();
+  }
+}
+
 /** Seconds for people: 0.42 s, 12.3 s, 2:05 min. */
 export function seconds(value) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "";

@@ -1,7 +1,7 @@
 // History: any journal's markings forwards and backwards, jump to an error, two runs side by side, a new run from here.
 
 import { Canvas, tool } from "./canvas.js";
-import { attribute, fill, h, seconds, text, words } from "./dom.js";
+import { attribute, fill, h, Press, seconds, text, words } from "./dom.js";
 import { listRuns, openRun } from "./files.js";
 import { icon } from "./icons.js";
 import { reasonText } from "./live.js";
@@ -101,6 +101,7 @@ export class History {
   constructor(link, operator) {
     Object.assign(this, { link, operator, index: 0, runs: [] });
     this.list = h("div", { class: "list" });
+    this.press = new Press(this.list);
     this.runsBox = h("nav", { class: "runs", "aria-label": "Runs" }, h("h2", {}, "Runs"), this.list);
     this.screens = [new Screen("Net at this record"), new Screen("Net of the compared run")];
     this.pair = h("div", { class: "pair" }, this.screens.map((s) => s.canvas.root));
@@ -184,6 +185,7 @@ export class History {
   // ---- runs ---------------------------------------------------------------------------------------------------------
 
   paintRuns() {
+    if (this.press.holds(() => this.paintRuns())) return;
     const own = this.session ? [{ id: SESSION, task: this.session.task.name, state: this.link.state.mission.state, seconds: null }] : [];
     fill(this.list, [...own, ...this.runs].map((run) => {
       const chosen = run.id === this.reel?.run.id;
@@ -203,8 +205,11 @@ export class History {
 
   async open(id, keep = false) {
     const ticket = (this.opening = (this.opening ?? 0) + 1);
+    attribute(this.root, "aria-busy", "true");
     const reel = await this.fetchReel(id);
-    if (!reel || ticket !== this.opening) return; // another run was chosen meanwhile
+    if (ticket !== this.opening) return; // another run was chosen meanwhile
+    attribute(this.root, "aria-busy", null);
+    if (!reel) return;
     this.reel = reel;
     this.screens[0].load(reel);
     this.range.max = String(reel.records.length);
@@ -215,7 +220,10 @@ export class History {
   }
 
   async compare(id) {
-    this.other = id ? await this.fetchReel(id) : null;
+    const ticket = (this.comparing = (this.comparing ?? 0) + 1);
+    const other = id ? await this.fetchReel(id) : null;
+    if (ticket !== this.comparing) return; // another run, or none, was chosen meanwhile
+    this.other = other;
     this.screens[1].canvas.root.hidden = !this.other;
     if (this.other) this.screens[1].load(this.other);
     this.screens[0].canvas.view.fit();

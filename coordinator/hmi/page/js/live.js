@@ -3,7 +3,7 @@
 import { Cameras, Devices } from "./camera.js";
 import { Canvas, panel } from "./canvas.js";
 import { Chart } from "./charts.js";
-import { attribute, fill, h, rows, seconds, text, words } from "./dom.js";
+import { attribute, fill, h, Press, rows, seconds, text, words } from "./dom.js";
 import { icon } from "./icons.js";
 import { stateOf } from "./operator.js";
 import { Learning, objectives } from "./learning.js";
@@ -26,6 +26,7 @@ export class Live {
     this.selected = new Selected(link, operator, (name) => this.open(name));
     this.running = panel("Running now", h("ul", { class: "cards" }));
     this.firings = panel("Last firings", h("ol", { class: "firings" }));
+    this.press = new Press(this.firings.content);
     this.nodes = panel("Nodes", h("ul", { class: "nodes" }));
     this.selectors = panel("Selectors", h("ul", { class: "selectors" }));
     this.result = h("section", { class: "result", role: "status", hidden: true });
@@ -202,6 +203,7 @@ export class Live {
   }
 
   paintFirings(now = true) {
+    if (this.press.holds(() => this.paintFirings())) return null;
     // each new row shifts all others: a busy net is read at four lists a second
     if (!now && performance.now() - (this.firingsAt ?? 0) < FIRINGS_MS) return this.stale.add("firings");
     this.firingsAt = performance.now();

@@ -1,6 +1,6 @@
 // The operator's controls: mission commands, who holds the controls, and the emergency stop that is always there.
 
-import { attribute, fill, h, seconds, text, words } from "./dom.js";
+import { attribute, fill, h, Press, seconds, text, words } from "./dom.js";
 import { listTasks, startForm } from "./files.js";
 import { icon } from "./icons.js";
 import { clearDialog, startDialog } from "./start.js";
@@ -43,6 +43,7 @@ export class Operator {
     this.options = h("button", { type: "button", class: "command", hidden: true, "aria-haspopup": "dialog", onclick: () => this.startWith() }, icon("more"), h("span", {}, "Start with"));
     this.picker = h("select", { class: "pick-task", "aria-label": "Task to start", onchange: () => this.load(), onfocus: () => this.listTasks() });
     this.controls = h("div", { class: "holder" });
+    this.press = new Press(this.controls);
     this.answer = h("p", { class: "pause-note", role: "status" });
     this.bar = h("div", { class: "operator", role: "toolbar", "aria-label": "Mission" }, this.picker, this.buttons.start, this.options, Object.values(this.buttons).slice(1), this.clear, this.answer, this.controls);
     this.estop = h("button", { type: "button", class: "estop", "aria-keyshortcuts": ESTOP_KEY, onclick: () => this.stopNow() },
@@ -159,7 +160,7 @@ export class Operator {
   showHolder(state) {
     const { controls, you } = state;
     const key = JSON.stringify([controls, you, this.link.connected]);
-    if (this.holderKey === key) return;
+    if (this.holderKey === key || this.press.holds(() => this.showHolder(this.link.state))) return;
     this.holderKey = key;
     const mine = controls.holder === you;
     const label = controls.holder === null ? "Nobody holds the controls" : mine ? "You hold the controls" : `${controls.holder} holds the controls`;

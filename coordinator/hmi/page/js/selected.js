@@ -1,6 +1,6 @@
 // What is known of the chosen place or transition, what it waits for, and what the operator may do with it.
 
-import { fill, h, seconds, words } from "./dom.js";
+import { fill, h, Press, seconds, words } from "./dom.js";
 import { icon } from "./icons.js";
 import { caption } from "./sheet.js";
 
@@ -11,6 +11,7 @@ export class Selected {
   constructor(link, operator, open) {
     Object.assign(this, { link, operator, open, name: null });
     this.root = h("section", { class: "panel selected", "aria-label": "Selected", hidden: true });
+    this.press = new Press(this.root);
   }
 
   choose(name) {
@@ -27,7 +28,8 @@ export class Selected {
     const stop = state.breakpoints.includes(`${place ? "places" : "transitions"}.${this.name}`);
     const key = JSON.stringify([this.name, state.marking[this.name], run?.id, run?.state, stop, this.link.mayAct, state.mission.state, transition && this.missing(state, transition), this.lastFiring(state)?.number]);
     if (key === this.key) return;
-    this.key = key;
+    if (this.drawn === this.name && this.press.holds(() => this.update(this.link.state, this.link.now()))) return;
+    Object.assign(this, { key, drawn: this.name });
     fill(this.root, place ? this.place(state, place, run, stop) : this.transition(state, transition, stop, now));
   }
 

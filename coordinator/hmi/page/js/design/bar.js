@@ -11,7 +11,7 @@ export class Bar {
   constructor(designer) {
     this.designer = designer;
     const { desk } = designer;
-    this.picker = h("select", { "aria-label": "Task", onchange: () => desk.pick(this.picker.value) });
+    this.picker = h("select", { "aria-label": "Task", onchange: () => designer.during(desk.pick(this.picker.value)) });
     this.state = h("span", { class: "saved", role: "status" });
     this.undo = tool("undo", "Undo", () => designer.undo());
     this.redo = tool("redo", "Redo", () => designer.redo());

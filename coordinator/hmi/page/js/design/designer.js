@@ -1,7 +1,7 @@
 // The designer: draw a task's net with mouse or keyboard. Puts its parts together and passes on what was edited.
 
 import { Canvas } from "../canvas.js";
-import { h, words } from "../dom.js";
+import { attribute, h, words } from "../dom.js";
 import { loadOffers } from "../files.js";
 import { placed } from "../layout.js";
 import { toast } from "../toast.js";
@@ -24,7 +24,7 @@ const PASTE_STEP = [40, 60];
 
 export class Designer {
   constructor(link, operator) {
-    Object.assign(this, { link, operator, offers: [] });
+    Object.assign(this, { link, operator, offers: [], offersAsked: 0, works: 0 });
     this.pointer = new Pointer(this);
     this.canvas = new Canvas("Drawing of the task", { keyed: true, down: (event) => this.pointer.down(event), chosen: (e, event) => this.pick(e.name, event), opened: (e) => this.opened(e), moved: () => this.canvas?.map.follow(), elsewhere: (matches) => this.elsewhere(matches) });
     this.canvas.view.fold(false);
@@ -53,10 +53,33 @@ export class Designer {
     return { names: this.selected.names, arc: this.selected.arc };
   }
 
-  async shown() {
-    this.offers = await loadOffers();
+  shown() {
+    return this.during(this.begin());
+  }
+
+  async begin() {
+    await this.askOffers();
     await this.desk.first();
-    this.inspector.show(this.selection, true);
+    this.inspector.show(this.selection);
+  }
+
+  /** Until `work` is done the page says that it is busy: what is drawn may alter, and move, without anybody's hand. */
+  async during(work) {
+    this.works += 1;
+    attribute(this.root, "aria-busy", "true");
+    try {
+      return await work;
+    } finally {
+      this.works -= 1;
+      attribute(this.root, "aria-busy", this.works ? "true" : null);
+    }
+  }
+
+  /** What the nodes offer: of several answers on their way the last one asked for counts, whichever comes last. */
+  async askOffers() {
+    const asked = ++this.offersAsked;
+    const offers = await loadOffers();
+    if (asked === this.offersAsked) this.offers = offers;
   }
 
   /** A node came or went: what can be chosen and what no node offers are other actions now. */
@@ -64,7 +87,7 @@ export class Designer {
     const states = JSON.stringify(Object.entries(this.link.state.nodes).map(([name, node]) => [name, node.state]));
     if (states === this.nodeStates || this.root.hidden) return;
     this.nodeStates = states;
-    this.offers = await loadOffers();
+    await this.askOffers();
     this.inspector.show(this.selection);
     this.findings.soon();
   }

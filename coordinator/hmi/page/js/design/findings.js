@@ -1,6 +1,6 @@
 // What the check says of the task that is drawn: a mark on the element, and a list that leads there.
 
-import { attribute, fill, h, words } from "../dom.js";
+import { attribute, fill, h, Press, words } from "../dom.js";
 import { checkDocument } from "../files.js";
 import { icon } from "../icons.js";
 import { around, drawnAs } from "./macros.js";
@@ -13,6 +13,7 @@ export class Findings {
   constructor(designer) {
     Object.assign(this, { designer, list: [], text: "" });
     this.root = h("section", { class: "strip", "aria-label": "Findings" });
+    this.press = new Press(this.root);
   }
 
   get errors() {
@@ -22,12 +23,14 @@ export class Findings {
   /** What the server said of a text: its findings, and the text itself. */
   take({ findings, text }) {
     Object.assign(this, { list: findings, text });
+    attribute(this.root, "aria-busy", null);
     this.paint();
   }
 
-  /** Ask once the drawing has rested a moment. */
+  /** Ask once the drawing has rested a moment; until the answer the list says what was found before. */
   soon() {
     clearTimeout(this.checking);
+    attribute(this.root, "aria-busy", "true");
     this.checking = setTimeout(() => this.check(), CHECK_MS);
   }
 
@@ -35,7 +38,11 @@ export class Findings {
     const { model } = this.designer;
     const checked = model.data;
     const said = await checkDocument(model.name, checked, model.renames);
-    if (!said || checked !== model.data) return;
+    if (checked !== model.data) return;
+    if (!said) {
+      attribute(this.root, "aria-busy", null);
+      return;
+    }
     this.take(said);
     if (!this.errors) this.designer.verdicts.soon();
     this.designer.inspector.show(this.designer.selection);
@@ -80,6 +87,7 @@ export class Findings {
   }
 
   paintList() {
+    if (this.press.holds(() => this.paintList())) return;
     const { errors } = this;
     const list = [...this.list].sort((a, b) => (ORDER[a.severity] ?? 2) - (ORDER[b.severity] ?? 2));
     fill(this.root, h("h2", {}, icon(errors ? "error" : "check"), errors ? `${errors} ${errors === 1 ? "fault" : "faults"}` : "May run", h("span", { class: "muted" }, list.length > errors ? `${list.length - errors} to look at` : "")),

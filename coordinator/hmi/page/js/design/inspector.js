@@ -1,6 +1,6 @@
 // The form for what is chosen in the designer: an element, an arc, several elements, or the task itself.
 
-import { fill, h, keep, words } from "../dom.js";
+import { fill, h, keep, Press, words } from "../dom.js";
 import { icon } from "../icons.js";
 import { toast } from "../toast.js";
 import { align, distribute, layOut } from "./arrange.js";
@@ -17,17 +17,19 @@ export class Inspector {
   constructor(designer) {
     this.designer = designer;
     this.root = h("aside", { class: "inspector", "aria-label": "Properties" });
+    this.press = new Press(this.root);
   }
 
   get model() {
     return this.designer.model;
   }
 
-  /** Draw the form for the selection {names, arc}; a form that is being typed into stays. */
+  /** Draw the form for the selection {names, arc}; a form that is being typed into stays, one that is pressed stays until then. */
   show(selection, force = false) {
     const typing = this.root.contains(document.activeElement) && ["INPUT", "TEXTAREA"].includes(document.activeElement.tagName);
     const key = JSON.stringify([[...selection.names], selection.arc?.id, this.model.sheet]);
-    if (typing && !force && key === this.key) return;
+    const same = key === this.key && !force;
+    if (same && (typing || this.press.holds(() => this.show(this.designer.selection)))) return;
     this.key = key;
     const [name] = selection.names;
     if (selection.arc) fill(this.root, this.arc(selection.arc));
