@@ -589,11 +589,13 @@ async def test_what_is_typed_while_the_page_loads_stays(browser: Browser, page: 
     await tab.get_by_role("tab", name="Design").click()
     await tab.get_by_role("button", name="New task").click()
     goal = tab.get_by_label("Goal", exact=True)
-    await goal.fill("typed early")
-    offers.set()
+    await goal.fill("typed")
+    async with tab.expect_response("**/api/tasks"):
+        offers.set()
     await settled(tab)
     await expect(goal).to_be_focused()
-    await goal.press("Enter")
+    await tab.keyboard.type(" early")
+    await tab.keyboard.press("Enter")
     await expect(goal).to_have_value("typed early")
     await expect(tab.locator(".saved")).to_have_text("not saved")
 

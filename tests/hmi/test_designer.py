@@ -6,7 +6,7 @@ import asyncio
 import os
 import re
 from collections import Counter
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,13 +18,13 @@ from coordinator.hmi.edits import edited, parse, plain
 from coordinator.hmi.server import Page
 from coordinator.taskfile import load
 from tests.drawing.conftest import random_task
-from tests.hmi.conftest import PATIENCE_MS, browser_missing, is_fault, note_toasts, served, staged, toasted
+from tests.hmi.conftest import PATIENCE_MS, browser_missing, is_fault, note_toasts, served, staged, toasted, until
 from tests.hmi.stage import Stage
 
 if browser_missing() and os.environ.get("CI") != "true":
     pytest.skip(browser_missing(), allow_module_level=True)
 
-from playwright.async_api import Browser, Locator, Route, expect
+from playwright.async_api import Browser, Locator, Route, WebSocketRoute, expect
 from playwright.async_api import Page as Tab
 
 pytestmark = [pytest.mark.asyncio(loop_scope="module"), pytest.mark.usefixtures("_windows_are_closed")]
@@ -140,6 +140,30 @@ async def test_chosen_elements_are_put_in_order(browser: Browser, page: Page, ta
     await save(tab)
     assert {name: (place.x, place.y) for name, place in load(path).places.items()} == before
     assert not complaints
+
+
+async def test_the_task_that_runs_is_opened_first(browser: Browser, page: Page, tasks: Path) -> None:
+    """Loaded with the designer in front the page waits until it knows which task runs, however many stand before it."""
+    (tasks / "earlier.toml").write_text((tasks / "pick_and_place.toml").read_text())
+    tab = await browser.new_page()
+    held: list[Callable[[], None]] = []
+
+    def slowly(socket: WebSocketRoute) -> None:
+        server = socket.connect_to_server()
+        socket.on_message(server.send)
+        server.on_message(lambda message: held.append(lambda: socket.send(message)))
+
+    await tab.route_web_socket("**/api/live", slowly)
+    async with tab.expect_response("**/api/offers"):
+        await tab.goto(f"{page.url}#Design")
+    picker = tab.get_by_label("Task", exact=True)
+    await expect(tab.locator(".designer")).to_have_attribute("aria-busy", "true")
+    await until(lambda: bool(held))
+    await expect(picker).to_have_value("")
+    while held:
+        held.pop(0)()
+    await settled(tab)
+    await expect(picker).to_have_value("pick_and_place")
 
 
 async def test_a_dragged_element_lands_on_the_grid(browser: Browser, page: Page, tasks: Path) -> None:

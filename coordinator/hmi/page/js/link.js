@@ -35,6 +35,7 @@ export class Link {
     this.number = 0;
     this.tries = 0;
     this.heardAt = 0;
+    this.met = new Promise((resolve) => (this.meet = resolve)); // the first snapshot has come, or will not soon
     setInterval(() => this.watch(), 500);
     document.addEventListener("visibilitychange", () => this.reschedule());
     this.open();
@@ -59,6 +60,7 @@ export class Link {
   lost(socket) {
     if (socket !== this.socket) return;
     this.socket = null;
+    this.meet();
     if (this.connected) {
       this.connected = false;
       this.note("connection");
@@ -128,6 +130,7 @@ export class Link {
     this.tries = 0;
     this.connected = true;
     this.goodbye = false;
+    this.meet();
     document.documentElement.dataset.sequence = String(this.state.sequence);
   }
 

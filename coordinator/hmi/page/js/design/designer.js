@@ -58,7 +58,7 @@ export class Designer {
   }
 
   async begin() {
-    await this.askOffers();
+    await Promise.all([this.askOffers(), this.link.met]); // which task runs decides what is opened first
     await this.desk.first();
     this.inspector.show(this.selection);
   }
