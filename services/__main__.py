@@ -13,9 +13,9 @@ from services.comm.directory import Directory, DirectoryError, parse, read_text,
 from services.comm.directory_file import nearest
 from services.comm.lockstep import CellError
 from services.comm.lockstep_process import run_member
+from services.comm.parentage import die_with, wanted_with_parent
 from services.comm.security import KeyFileError, KeyNeededError
 from services.lockstep_node import LockstepNode
-from services.parentage import die_with, wanted_with_parent
 from services.scripted import ScriptError
 from services.scripted import load as load_script
 from services.shell import serve

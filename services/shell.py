@@ -18,10 +18,10 @@ from services.comm.credentials import credentials
 from services.comm.directory import Directory, DirectoryError
 from services.comm.latch import STATE, latch_of
 from services.comm.notice import Notice
+from services.comm.parentage import GOOD_ORDER, outlive, wanted_with_parent
 from services.comm.security import require_key
 from services.comm.server import Server
 from services.node import GENERAL, Node, stream_service
-from services.parentage import GOOD_ORDER, outlive, wanted_with_parent
 from services.place import Place
 from services.remote import IN_EMERGENCY
 from services.worker import Setup

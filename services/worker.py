@@ -20,10 +20,10 @@ from pathlib import Path
 from typing import Any
 
 from services.comm.directory import Directory, DirectoryError, parse
+from services.comm.parentage import STOP_ROUTINE, die_with, outlive
 from services.device import Driver
 from services.device_process import DeviceLoop, take_priority
 from services.drivers import make_driver
-from services.parentage import STOP_ROUTINE, die_with, outlive
 from services.pipe import NewestLink, Pipe
 from services.place import InlinePlace
 from services.ports import ProcessPorts

@@ -37,7 +37,7 @@ class _Worker:
     async def start(cls, plan: str, log: Path) -> _Worker:
         """Launch a process and tell it the plan; what it says beside its answers goes to `log`."""
         pipe = asyncio.subprocess.PIPE
-        command = (sys.executable, "-m", "coordinator.campaign.worker")
+        command = (sys.executable, "-m", "coordinator.campaign.worker", str(os.getpid()))
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p), **ONE_THREAD}
         with log.open("ab") as said:
             process = await asyncio.create_subprocess_exec(

@@ -1,6 +1,7 @@
 """A campaign's worker process: blocks in on standard input, results out on standard output, one JSON text a line.
 
-The first line is the plan. Whatever else writes to standard output (drivers do) goes to standard error.
+Its argument is its parent's process id: it ends with it, also in the middle of a block or of an action that hangs. The first line
+is the plan. Whatever else writes to standard output (drivers do) goes to standard error.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Any, TextIO
 
 from coordinator.campaign.block import Bench, run_block
 from coordinator.campaign.plan import Block, CampaignError, Plan
+from services.comm.parentage import die_with
 
 
 @lru_cache(maxsize=1)
@@ -44,6 +46,7 @@ def serve(orders: TextIO, answers: TextIO) -> None:
 
 def main() -> None:
     """Keep the way to the parent for answers alone."""
+    die_with(int(sys.argv[1]))
     with os.fdopen(os.dup(1), "w", encoding="utf-8") as answers:
         os.dup2(2, 1)
         try:

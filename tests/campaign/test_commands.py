@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import pty
 import select
+import signal
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +144,55 @@ def test_a_killed_campaign_goes_on(tmp_path: Path) -> None:
     assert table.read_bytes() == (tmp_path / "whole" / "table.csv").read_bytes()
     sessions = (tmp_path / "part" / "sessions.csv").read_text(encoding="utf-8").splitlines()
     assert len(sessions) == 3  # the killed one is known, too
+
+
+@pytest.mark.processes
+def test_no_worker_outlives_a_killed_campaign(tmp_path: Path) -> None:
+    """Not even one that hangs, here because it is frozen."""
+    command = [
+        sys.executable,
+        "-m",
+        "coordinator",
+        "campaign",
+        *TOY,
+        "--runs",
+        "20000",
+        "--regime",
+        "easy",
+        "--workers",
+        "2",
+    ]
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{HERE}"}
+    campaign = subprocess.Popen(
+        [*command, "--out", "part"], cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    try:
+        _until(lambda: len(_children(campaign.pid)) == 2)
+        workers = [os.pidfd_open(pid) for pid in _children(campaign.pid)]
+        _until(lambda: (tmp_path / "part" / "table.csv").exists())
+        for worker in workers:
+            signal.pidfd_send_signal(worker, signal.SIGSTOP)
+    finally:
+        campaign.kill()
+        campaign.wait()
+    gone = [bool(select.select([worker], [], [], 30.0)[0]) for worker in workers]
+    for worker in workers:
+        with contextlib.suppress(ProcessLookupError):
+            signal.pidfd_send_signal(worker, signal.SIGKILL)
+        os.close(worker)
+    assert gone == [True, True]
+
+
+def _children(parent: int) -> list[int]:
+    return [int(pid) for pid in Path(f"/proc/{parent}/task/{parent}/children").read_text(encoding="ascii").split()]
+
+
+def _until(condition: Callable[[], bool]) -> None:
+    """Wait for a condition, at most a minute."""
+    over = time.monotonic() + 60.0
+    while not condition():
+        assert time.monotonic() < over
+        select.select([], [], [], 0.01)
 
 
 @pytest.mark.parametrize(
