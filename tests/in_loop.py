@@ -1,22 +1,12 @@
-"""A node in the test's own event loop, and ports to put it on."""
+"""A node in the test's own event loop."""
 
 from __future__ import annotations
 
 import asyncio
-import socket
 
 from services.comm.server import Server
 from services.node import Node
 from tests.waiting import beat
-
-
-def free_ports(count: int) -> list[int]:
-    """Ports of this host that nobody listens on now."""
-    probes = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
-    ports: list[int] = [probe.getsockname()[1] for probe in probes]
-    for probe in probes:
-        probe.close()
-    return ports
 
 
 class NodeInLoop:

@@ -35,7 +35,7 @@ from services.comm.client import Client
 from services.comm.directory import Directory, parse
 from services.comm.messages import Hello
 from tests.bench.processes import load, quantile
-from tests.chaos.shuttle_cell import free_ports
+from tests.ports import free_ports
 
 LINES = 8
 """Independent lines of the group task: so many starts at once."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import socket
 from collections import Counter
 from pathlib import Path
+
+from tests.ports import free_ports
 
 ROOT = Path(__file__).parents[2]
 TASK = Path(__file__).with_name("shuttle.toml")
@@ -47,15 +48,6 @@ device = "right_hand"
 orphan_time = {orphan}
 args = {{ log = "{log}", hand = "right", seconds = 0.02 }}
 """
-
-
-def free_ports(count: int) -> list[int]:
-    """Ports of this host that nobody listens on now."""
-    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
-    ports = [int(one.getsockname()[1]) for one in sockets]
-    for one in sockets:
-        one.close()
-    return ports
 
 
 def shuttle_services(folder: Path, *, fetch: float = 0.05, carry: float = 0.1, orphan: float = 1.0) -> Path:

@@ -32,7 +32,8 @@ from coordinator.supervisor import Supervisor
 from coordinator.task import Status
 from services.comm.directory import load
 from tests.chaos.by_proxy import NODES
-from tests.chaos.shuttle_cell import ROOT, TASK, free_ports, moves, shuttle_services
+from tests.chaos.shuttle_cell import ROOT, TASK, moves, shuttle_services
+from tests.ports import free_ports
 from tests.waiting import beat
 
 MARK = "PETROBOT_STORM"

@@ -12,7 +12,8 @@ from services.comm.directory import Directory, parse
 from services.device import Ports
 from services.node import Node
 from services.place import InlinePlace
-from tests.in_loop import NodeInLoop, free_ports
+from tests.in_loop import NodeInLoop
+from tests.ports import free_ports
 
 SERVICES = """\
 schema = 1

@@ -84,7 +84,7 @@ class Terminal:
         said = self._read()
         return Said(code, said.out, said.err)
 
-    async def until(self, holds: Callable[[], bool], timeout: float = 20.0) -> None:
+    async def until(self, holds: Callable[[], bool], timeout: float = 60.0) -> None:
         """Wait until something holds."""
         async with asyncio.timeout(timeout):
             while not holds():

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from coordinator.cli import COMMANDS, main
+from tests.ports import free_ports
 
 ROOT = Path(__file__).parents[2]
 
@@ -82,9 +83,7 @@ def test_nodes_that_are_not_there_are_exit_code_3(tmp_path: Path, capsys: pytest
 @pytest.mark.processes
 def test_a_node_ends_with_its_command(tmp_path: Path) -> None:
     """`petrobot node` is the node, not its parent: a signal that ends the command leaves nothing that holds the port."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    [port] = free_ports(1)
     services = tmp_path / "services.toml"
     services.write_text(f'schema = 1\n[nodes.n]\nhost = "127.0.0.1"\nport = {port}\n[services.memory]\nnode = "n"\n')
     command = [sys.executable, "-m", "coordinator", "node", "n", "--services", str(services)]
@@ -92,7 +91,7 @@ def test_a_node_ends_with_its_command(tmp_path: Path) -> None:
         assert node.stdout is not None
         assert node.stdout.readline() == f"node n ready on 127.0.0.1:{port}, process {node.pid}\n"
         node.terminate()
-        assert node.wait(20.0) == 0
+        assert node.wait(60.0) == 0
     with socket.socket() as again:
         assert again.connect_ex(("127.0.0.1", port)) != 0
 

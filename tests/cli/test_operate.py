@@ -192,7 +192,7 @@ async def test_controls_of_a_script_go_free(petrobot: Terminal, monkeypatch: pyt
         body = {"verb": "take_controls", "name": "script"}
         async with http.post(f"{petrobot.page.base}/api/command", json=body) as answer:
             assert (await answer.json())["ok"]
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(60):
         while (await petrobot("pause", "--as", "ana")).code != 0:
             await beat(0.01)
 

@@ -48,7 +48,7 @@ class Node:
 
     async def order(self, kind: type[Any]) -> Any:
         """The next order of this kind."""
-        async with asyncio.timeout(5.0):
+        async with asyncio.timeout(60.0):
             while not any(isinstance(order, kind) for order in self.orders):
                 self.ordered.clear()
                 await self.ordered.wait()
@@ -74,7 +74,7 @@ class Coordinator:
 
     async def notice(self, kind: type[Any], number: int = 1) -> Any:
         """The so-manieth notice of this kind."""
-        async with asyncio.timeout(5.0):
+        async with asyncio.timeout(60.0):
             while len(found := [notice for notice in self.notices if isinstance(notice, kind)]) < number:
                 self.told.clear()
                 await self.told.wait()
@@ -91,7 +91,7 @@ async def until(condition: Callable[[], bool]) -> None:
     with pytest.MonkeyPatch.context() as patch:
         for owner, name in ((Server, "arm"), (Server, "gone"), (Client, "flush"), (Link, "_beat")):
             patch.setattr(owner, name, _and_then(getattr(owner, name), stirred.set))
-        async with asyncio.timeout(5.0):
+        async with asyncio.timeout(60.0):
             while not condition():
                 stirred.clear()
                 await stirred.wait()

@@ -21,7 +21,7 @@ from .ends import HELLO, Coordinator, Node, frame, read_all, until
 async def test_a_peer_that_is_silent_is_cut(open_node: Node) -> None:
     reader, writer = await asyncio.open_connection(*open_node.server.address)
     writer.write(frame(HELLO))
-    async with asyncio.timeout(5.0):
+    async with asyncio.timeout(60.0):
         said = await read_all(reader)
     assert b"vision" not in said and frame(m.Ping(1)) in said
     writer.close()
@@ -49,7 +49,7 @@ async def test_a_node_that_is_silent_is_lost_at_once(open_node: Node) -> None:
 async def test_a_slow_handshake_is_cut(open_node: Node, said: bytes) -> None:
     reader, writer = await asyncio.open_connection(*open_node.server.address)
     writer.write(said)
-    async with asyncio.timeout(5.0):
+    async with asyncio.timeout(60.0):
         assert await read_all(reader) == b""
     writer.close()
 

@@ -198,7 +198,7 @@ async def test_a_node_that_lives_long_looks_each_day(
             again.set()
 
     monkeypatch.setattr("services.comm.server.look_again", look)
-    async with asyncio.timeout(10.0), node(made(tmp_path, LIFE)):
+    async with asyncio.timeout(60.0), node(made(tmp_path, LIFE)):
         await again.wait()
 
 
@@ -210,7 +210,7 @@ async def test_ended_certificates_are_named_as_the_reason(
     folder = made(tmp_path / "keys", max(node_left, own_left), ())
     make_certificates(folder, ["vision"], NOW - LIFE + node_left)
     make_certificates(folder, ["coordinator"], NOW - LIFE + own_left)
-    async with asyncio.timeout(10.0), node(folder) as server:
+    async with asyncio.timeout(60.0), node(folder) as server:
         capsys.readouterr()
         proves = Credentials("coordinator", None, folder)
         client = Client(*server.address, Caller("vision", HELLO, auto_ack=True), tls=proves.client())
@@ -229,7 +229,7 @@ async def test_nodes_shows_when_the_certificate_ends_that_a_node_really_shows(
 ) -> None:
     """What was renewed on disk but not taken up by the running node is still shown as ending."""
     folder = made(tmp_path / "keys", 12 * DAY)
-    async with asyncio.timeout(20.0), node(folder) as server:
+    async with asyncio.timeout(60.0), node(folder) as server:
         make_certificates(folder, ["vision"], NOW)
         places = tmp_path / "services.toml"
         port = server.address[1]

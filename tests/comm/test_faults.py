@@ -23,7 +23,7 @@ from services.comm.stream import Incoming, StreamReceiver
 from .fault_parts import HOST, STREAM, Cable, Fault, first_line, inflict, part
 
 pytestmark = pytest.mark.processes
-LIMIT = 20.0
+LIMIT = 60.0
 
 
 class Told:

@@ -7,7 +7,6 @@ device that takes a set-point stream, and a timer; once on loopback without, onc
 from __future__ import annotations
 
 import os
-import socket
 import subprocess
 import sys
 import time
@@ -20,6 +19,7 @@ import pytest
 
 from tests.comm import foreign as f
 from tests.comm.foreign import Foreign, pack
+from tests.ports import free_ports
 
 pytestmark = pytest.mark.processes
 ROOT = Path(__file__).parents[2]
@@ -73,8 +73,7 @@ class Hub:
 
 def launched(folder: Path, key: bytes | None) -> tuple[subprocess.Popen[str], tuple[str, int]]:
     """The node, ready."""
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        port = int(probe.getsockname()[1])
+    [port] = free_ports(1)
     text = PLACES.format(port=port)
     if key is not None:
         file = folder / "cell.key"
@@ -101,7 +100,7 @@ def process(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     node, address = launched(tmp_path_factory.mktemp("hub"), request.param)
     yield Hub(address, request.param, [])
     node.terminate()
-    node.communicate(timeout=20.0)
+    node.communicate(timeout=60.0)
 
 
 @pytest.fixture

@@ -86,7 +86,7 @@ def test_a_member_that_dies_comes_back_to_where_the_others_are(told: Collection[
             mortal.live(death, told, 100, rejoins=death > 7)
     assert mortal.live(None, (), 30, rejoins=True) == "until"
     for thread in threads:
-        thread.join(30.0)
+        thread.join(60.0)
         assert not thread.is_alive(), "a member hangs"
     assert ends == dict.fromkeys(NODES, ("coordinator: until", 30))
     assert all(toy.ticks == list(range(30)) for toy in toys.values())
@@ -117,5 +117,5 @@ def test_one_that_does_not_come_back_is_lost_after_its_absence() -> None:
     thread.start()
     with pytest.raises(_Killed):
         _Mortal(addresses, None).live(5, ("motion",), 100, rejoins=False)
-    thread.join(30.0)
+    thread.join(60.0)
     assert not thread.is_alive() and failures and failures[0].startswith("coordinator: nobody answers on 127.0.0.1")

@@ -73,7 +73,7 @@ def vision(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Vision]:
     host, _, port = said.partition("ready on ")[2].partition(",")[0].rpartition(":")
     yield Vision(process, (host, int(port)))
     process.terminate()
-    process.communicate(timeout=20.0)
+    process.communicate(timeout=60.0)
 
 
 def ask(client: Foreign, number: int) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import select
-import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -15,6 +14,7 @@ from services.comm.can_stream import connect
 from services.comm.canbus import Frame
 from services.comm.cia402 import RECEIVED, SENT, Command, State, command_of, state_of
 from services.comm.directory import Directory, parse
+from tests.ports import free_ports
 
 ROOT = Path(__file__).parents[2]
 DRIVES = range(1, 7)
@@ -111,10 +111,7 @@ out = ["out_of_order"]
 
 def cell_in(folder: Path, speed: float = SLOW) -> Directory:
     """The location file on free ports, and the task `sweeping.toml` beside it."""
-    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(3)]
-    laboratory, motion, bus = (one.getsockname()[1] for one in sockets)
-    for one in sockets:
-        one.close()
+    laboratory, motion, bus = free_ports(3)
     path = folder / "services.toml"
     text = SERVICES.format(
         laboratory=laboratory, motion=motion, bus=bus, cell=ROOT / "services" / "cell.toml", speed=speed
@@ -153,7 +150,7 @@ class Ear:
             self.quick_stop_at, self.energised = None, 0
             self._origin = dict(self.positions)
 
-    def until(self, holds: Callable[[Ear], bool], timeout: float = 30.0) -> None:
+    def until(self, holds: Callable[[Ear], bool], timeout: float = 60.0) -> None:
         """Wait until what has been heard fits. Raises TimeoutError."""
         with self._changed:
             if not self._changed.wait_for(lambda: holds(self), timeout):

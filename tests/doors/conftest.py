@@ -122,7 +122,7 @@ class GoodClient:
         """Wait until it has been served some more; raises what it met with meanwhile."""
         assert self._task is not None
         wanted = self.served + more
-        async with asyncio.timeout(30.0):
+        async with asyncio.timeout(60.0):
             while self.served < wanted:
                 if self._task.done():
                     self._task.result()
@@ -166,7 +166,7 @@ class Stranger:
         return decode(body)
 
     async def _body(self) -> bytes:
-        async with asyncio.timeout(20.0):
+        async with asyncio.timeout(60.0):
             head = await self.reader.readexactly(4)
             body = await self.reader.readexactly(int.from_bytes(head, "big"))
         if len(self.heard) < KEPT:

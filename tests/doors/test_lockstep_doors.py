@@ -12,7 +12,8 @@ from coordinator.taskfile import load as load_task
 from services.comm.directory import Directory, parse
 from services.comm.lockstep_process import cell_key
 from services.comm.security import KeyNeededError, new_key, write_key
-from tests.chaos.shuttle_cell import SERVICES, TASK, free_ports
+from tests.chaos.shuttle_cell import SERVICES, TASK
+from tests.ports import free_ports
 
 FAR = "192.0.2.7"  # RFC 5737: an address that is nobody's
 

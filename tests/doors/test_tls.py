@@ -31,7 +31,7 @@ async def outcome_of(client: Client) -> m.Outcome:
     """What becomes of one call."""
     client.start()
     try:
-        async with asyncio.timeout(20.0):
+        async with asyncio.timeout(60.0):
             return await client.call("echo", {"n": 1})
     finally:
         await client.close()
@@ -49,7 +49,7 @@ async def test_who_has_a_certificate_of_the_cell_is_served(victim: Start, certif
     server = victim(folder=str(certificates))
     client = server.client()
     client.start()
-    async with asyncio.timeout(20.0):
+    async with asyncio.timeout(60.0):
         assert (await client.call("echo", {"n": 1})).values == {"n": 1}
         big = (await client.call("echo", {"b": bytes(3 << 20)})).values
     assert big == {"b": bytes(3 << 20)}
@@ -224,7 +224,7 @@ async def test_client_tells_why_it_is_lost(victim: Start, certificates: Path, tm
     server = victim(folder=str(certificates))
     client = server.client(tls=context(tmp_path, "coordinator"))
     client.start()
-    async with asyncio.timeout(20.0):
+    async with asyncio.timeout(60.0):
         while "our certificate is not trusted" not in client.trouble:
             await beat(0.005)
     await client.close()

@@ -196,7 +196,7 @@ async def finished(stage: Stage) -> None:
 
     stage.on_beat.append(beat)
     stop = stage.subscribe(lambda c: over.set() if c["kind"] == "mission" and "reason" in c["mission"] else None)
-    await asyncio.wait_for(over.wait(), 20)
+    await asyncio.wait_for(over.wait(), 60)
     stop()
 
 

@@ -6,7 +6,6 @@ import asyncio
 import os
 import re
 import signal
-import socket
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -25,6 +24,7 @@ from playwright.async_api import Browser, expect
 from playwright.async_api import Page as Tab
 
 from tests.hmi.test_browser import SIZE, Watch, checked, draw_the_task, element, hold_controls, settled
+from tests.ports import free_ports
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 ROOT = Path(__file__).parents[2]
@@ -86,13 +86,8 @@ class Served:
 @asynccontextmanager
 async def serving(folder: Path) -> AsyncIterator[Served]:
     """`petrobot serve --up --mock` in a folder of its own."""
-    probes = [socket.socket() for _ in range(2)]
-    for probe in probes:
-        probe.bind(("127.0.0.1", 0))
-    (folder / "services.toml").write_text(SERVICES.format(*(p.getsockname()[1] for p in probes)), encoding="utf-8")
+    (folder / "services.toml").write_text(SERVICES.format(*free_ports(2)), encoding="utf-8")
     (folder / "script.toml").write_text(SCRIPT, encoding="utf-8")
-    for probe in probes:
-        probe.close()
     command = ["-c", "import sys; from coordinator.cli import main; sys.exit(main())", "serve", "--up"]
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, *command, "--mock", "script.toml"),

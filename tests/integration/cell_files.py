@@ -3,21 +3,13 @@
 from __future__ import annotations
 
 import re
-import socket
 from collections.abc import Mapping
 from pathlib import Path
 
+from tests.ports import free_ports
+
 ROOT = Path(__file__).parents[2]
 SHIPPED = (ROOT / "services.toml").read_text(encoding="utf-8")
-
-
-def free_ports(count: int) -> list[int]:
-    """Ports of this host that nobody listens on now."""
-    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
-    ports = [s.getsockname()[1] for s in sockets]
-    for one in sockets:
-        one.close()
-    return ports
 
 
 def services_file(folder: Path, *, edits: Mapping[str, str] | None = None, more: str = "") -> Path:

@@ -12,7 +12,6 @@ import functools
 import json
 import os
 import signal
-import socket
 import sys
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -32,6 +31,7 @@ from coordinator.record.runfolder import header
 from services.comm.cell import Delays
 from services.comm.directory import Directory, load, resolve
 from services.comm.lockstep import Member
+from tests.ports import free_ports
 
 CELL = "cell"
 TASK = "catch_ball"
@@ -106,10 +106,7 @@ class Experiment:
         folder.mkdir(parents=True)
         self._log = folder / "executed.txt"
         self._log.touch()
-        ports = [socket.create_server(("127.0.0.1", 0)) for _ in range(2)]
-        self._addresses = dict(zip((CELL, NAME), (one.getsockname() for one in ports), strict=True))
-        for port in ports:
-            port.close()
+        self._addresses = {name: ("127.0.0.1", port) for name, port in zip((CELL, NAME), free_ports(2), strict=True)}
         self._hosts = {**dict.fromkeys(self.directory.nodes, CELL), NAME: NAME}
 
     def run(self, kills: Sequence[int]) -> dict[str, Any]:

@@ -18,8 +18,8 @@ from services.comm.client import Client
 from services.comm.directory import load
 from services.comm.messages import Call, Hello
 from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
-from tests.chaos.shuttle_cell import free_ports
 from tests.integration.test_resume_processes import nodes
+from tests.ports import free_ports
 from tests.waiting import beat
 
 pytestmark = pytest.mark.processes

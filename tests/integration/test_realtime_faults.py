@@ -65,7 +65,7 @@ async def arm_state(shell: RealtimeMission) -> dict[str, Any]:
     now = asyncio.get_running_loop().time()
     shell.mission.callers["motion"].command(now, Command("test/status", "status"))
     shell.clients["motion"].flush(now)
-    return await asyncio.wait_for(told, 10.0)
+    return await asyncio.wait_for(told, 60.0)
 
 
 async def run_and_kill(

@@ -61,7 +61,7 @@ class Ports:
 
     def images(self) -> Any:
         """None here."""
-        raise NotImplementedError
+        raise LookupError("no camera stands in this yard")
 
     def stream(self, name: str) -> SetpointReceiver:
         """The stream of sights."""

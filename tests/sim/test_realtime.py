@@ -19,7 +19,7 @@ from services.comm.party import TICK
 from sim.laboratory import Laboratory
 from sim.realtime import LaboratoryShell, bus_channel, camera_address
 from sim.truth import LaboratoryError
-from tests.in_loop import free_ports
+from tests.ports import free_ports
 from tests.sim.laboratory_shell import PATIENCE, REPOSITORY, call, program, running, score_as_member, until
 
 

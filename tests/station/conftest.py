@@ -15,7 +15,8 @@ from services.comm.directory import Directory, parse
 from services.node import GENERAL, Node
 from services.place import InlinePlace
 from services.scripted import load
-from tests.in_loop import NodeInLoop, free_ports
+from tests.in_loop import NodeInLoop
+from tests.ports import free_ports
 from tests.waiting import beat
 
 SERVICES = """\
@@ -141,7 +142,7 @@ class Cell:
         """A command by the operator."""
         return await self.station.command("ana", verb, data)
 
-    async def until(self, holds: Callable[[], bool], timeout: float = 20.0) -> None:
+    async def until(self, holds: Callable[[], bool], timeout: float = 60.0) -> None:
         """Wait until something holds."""
         async with asyncio.timeout(timeout):
             while not holds():

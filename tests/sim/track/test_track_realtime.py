@@ -20,7 +20,7 @@ from sim.realtime import LaboratoryShell, bus_channel, camera_address
 from sim.track import Track
 from sim.track_laboratory import TrackLaboratory
 from sim.truth import LaboratoryError
-from tests.in_loop import free_ports
+from tests.ports import free_ports
 from tests.sim.laboratory_shell import PATIENCE, REPOSITORY, call, program, running, score_as_member, until
 
 
