@@ -12,6 +12,7 @@ import pytest
 from services.comm.lockstep import Member, PartyLostError
 from services.comm.party import TICK
 from tests.comm.toy_party import Toy
+from tests.ports import free_ports
 
 NODES = ("arm", "motion", "vision")
 MORTAL = "coordinator"
@@ -66,9 +67,8 @@ class _Mortal:
 @pytest.mark.parametrize("told", [(), ("arm",), ("motion", "vision"), NODES])
 def test_a_member_that_dies_comes_back_to_where_the_others_are(told: Collection[str], key: bytes | None) -> None:
     """Killed twice, each time with its last Tick sent to some of its peers only; then it ends the cell."""
-    listeners = {name: socket.create_server(("127.0.0.1", 0)) for name in (*NODES, MORTAL)}
-    addresses = {name: one.getsockname() for name, one in listeners.items()}
-    listeners.pop(MORTAL).close()
+    listeners = {name: socket.create_server(("127.0.0.1", 0)) for name in NODES}
+    addresses = {name: one.getsockname() for name, one in listeners.items()} | {MORTAL: ("127.0.0.1", free_ports(1)[0])}
     toys = {name: _Counting(name) for name in NODES}
     ends: dict[str, Any] = {}
 
@@ -101,8 +101,7 @@ def test_a_member_that_dies_comes_back_to_where_the_others_are(told: Collection[
 
 def test_one_that_does_not_come_back_is_lost_after_its_absence() -> None:
     listener = socket.create_server(("127.0.0.1", 0))
-    with socket.create_server(("127.0.0.1", 0)) as other:
-        addresses = {MORTAL: other.getsockname(), "motion": listener.getsockname()}
+    addresses = {MORTAL: ("127.0.0.1", free_ports(1)[0]), "motion": listener.getsockname()}
     failures: list[Any] = []
 
     def survive() -> None:

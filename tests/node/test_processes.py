@@ -328,7 +328,7 @@ async def test_a_dying_worker_is_reported_and_started_again(operator: Operator, 
 
 
 async def test_kill_9_of_a_worker_in_mid_run(operator: Operator) -> None:
-    assert (await operator.call("go", to=0.0)).status == "success"
+    assert (await operator.call("go", to=0.0, timeout=PATIENCE)).status == "success"
     running = asyncio.create_task(operator.call("go", to=90.0, timeout=PATIENCE))
     await operator.until(lambda: _moving(operator))
     found = await pids(operator, "left", "slide")
@@ -354,14 +354,14 @@ async def _moving(operator: Operator) -> bool:
 
 
 async def test_kill_9_of_a_driver(operator: Operator) -> None:
-    assert (await operator.call("go", to=0.0)).status == "success"
+    assert (await operator.call("go", to=0.0, timeout=PATIENCE)).status == "success"
     running = asyncio.create_task(operator.call("go", to=90.0, timeout=PATIENCE))
     await operator.until(lambda: _moving(operator))
     found = await pids(operator, "left", "slide")
     os.kill(found["driver"], signal.SIGKILL)
     end = await running
     assert (end.status, end.cause, end.executed) == ("error", "device_died", "unknown"), end.text
-    assert (await operator.call("go", to=0.0)).status == "success"
+    assert (await operator.call("go", to=0.0, timeout=PATIENCE)).status == "success"
     now = await pids(operator, "left", "slide")
     assert now["driver"] != found["driver"] and not alive(found["actions"])
 
