@@ -172,8 +172,8 @@ async def test_controls_are_asked_for_and_handed_over(petrobot: Terminal) -> Non
 
     async with connect(find_door(folder=petrobot.runs), "ana") as ana:
         assert (await ana.command("take_controls"))["ok"]
-        asking = asyncio.create_task(petrobot("pause", "--as", "bob", "--take", "20"))
-        assert await ana.until(lambda state: bool(state["controls"]["asking"]), 20)
+        asking = asyncio.create_task(petrobot("pause", "--as", "bob", "--take", "60"))
+        assert await ana.until(lambda state: bool(state["controls"]["asking"]), 60)
         (bob,) = ana.state["controls"]["asking"]
         assert (await ana.command("release_controls", {"to": bob}))["ok"]
         assert (await asking).code == 0

@@ -114,7 +114,7 @@ async def _served_under_attack(frames: int) -> None:
     node = Node(timing=Timing(handshake=0.2))
     await node.server.start("127.0.0.1", 0)
     coordinator = node.client(timing=Timing())
-    assert await coordinator.client.connected(5.0)
+    assert await coordinator.client.connected(60.0)
     attack = asyncio.gather(*(_attack(node.server.address, frames // 4, seed) for seed in range(4)))
     served = 0
     while not attack.done():

@@ -395,7 +395,7 @@ def test_members_with_different_directories_do_not_form_a_cell() -> None:
     listeners, addresses = _listeners(["a", "b"])
 
     def member(name: str, directory: str) -> Callable[[], None]:
-        return Member(name, [Post(name)], addresses, listener=listeners[name], directory=directory, joining=0.5).open
+        return Member(name, [Post(name)], addresses, listener=listeners[name], directory=directory, joining=2.0).open
 
     a, b = _in_threads([member("a", "d1"), member("b", "d2")])
     assert isinstance(b, CellError) and "different services.toml" in str(b)

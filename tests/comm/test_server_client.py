@@ -17,7 +17,7 @@ from .ends import Coordinator, Node, until
 
 async def test_a_service_and_an_action(node: Node, key: bytes | None) -> None:
     coordinator = node.client(key=key)
-    assert await coordinator.client.connected(5.0)
+    assert await coordinator.client.connected(60.0)
     outcome = await coordinator.client.call("echo", {"x": [1, 2.5, "a", b"b", None]}, deadline=1.0)
     assert outcome.status == "success" and outcome.values == {"x": [1, 2.5, "a", b"b", None]}
     many = await asyncio.gather(*(coordinator.client.call("echo", {"n": n}) for n in range(200)))
@@ -55,7 +55,7 @@ async def test_calls_of_several_clients_of_a_process_have_ids_of_their_own(open_
 
 async def test_a_command_and_an_event(open_node: Node) -> None:
     coordinator = open_node.client()
-    assert await coordinator.client.connected(5.0)
+    assert await coordinator.client.connected(60.0)
     coordinator.caller.command(coordinator.client.now(), m.Command("k1", "status"))
     coordinator.client.flush()
     await open_node.order(object)
@@ -67,7 +67,7 @@ async def test_a_command_and_an_event(open_node: Node) -> None:
 
 async def test_cancelling_the_future_cancels_the_call(open_node: Node) -> None:
     coordinator = open_node.client()
-    assert await coordinator.client.connected(5.0)
+    assert await coordinator.client.connected(60.0)
     task = asyncio.ensure_future(coordinator.client.call("move"))
     await open_node.order(StartRun)
     task.cancel()
@@ -82,7 +82,7 @@ async def test_cancelling_the_future_cancels_the_call(open_node: Node) -> None:
 
 async def test_a_result_or_a_call_too_large_for_a_frame_ends_that_call_alone(node: Node, key: bytes | None) -> None:
     coordinator = node.client(key=key)
-    assert await coordinator.client.connected(5.0)
+    assert await coordinator.client.connected(60.0)
     huge, too_big, fine = await asyncio.gather(
         coordinator.client.call("big"),
         coordinator.client.call("echo", {"b": bytes(17 << 20)}),
@@ -96,7 +96,7 @@ async def test_a_result_or_a_call_too_large_for_a_frame_ends_that_call_alone(nod
 
 async def test_the_heart_keeps_an_idle_link_up_and_a_broken_one_comes_back(open_node: Node) -> None:
     coordinator = open_node.client()
-    assert await coordinator.client.connected(5.0)
+    assert await coordinator.client.connected(60.0)
     link = open_node.server._links["coord"]
     await until(lambda: link._pings + coordinator.client._link._pings >= 6)  # type: ignore[union-attr]
     assert not any(isinstance(notice, PeerLost) for notice in coordinator.notices)
@@ -111,7 +111,7 @@ async def test_the_heart_keeps_an_idle_link_up_and_a_broken_one_comes_back(open_
 
 async def test_a_run_whose_caller_is_gone_is_stopped(open_node: Node) -> None:
     coordinator = open_node.client()
-    assert await coordinator.client.connected(5.0)
+    assert await coordinator.client.connected(60.0)
     coordinator.call("1", "move")
     await open_node.order(StartRun)
     await coordinator.client.close()
@@ -167,13 +167,13 @@ async def test_a_wrong_key_is_told_to_both(key: bytes | None) -> None:
 
 async def test_a_second_process_of_a_name_is_refused_and_a_newer_epoch_takes_over(open_node: Node) -> None:
     first = open_node.client()
-    assert await first.client.connected(5.0)
+    assert await first.client.connected(60.0)
     second = open_node.client(m.Hello(1, 1, "coordinator", "coord", "c2", 1))
     outcome = await second.client.call("echo")
     assert "name_taken" in outcome.text
     await second.client.close()
     third = open_node.client(m.Hello(1, 1, "coordinator", "coord", "c3", 2))
-    assert await third.client.connected(5.0)
+    assert await third.client.connected(60.0)
     await first.notice(PeerLost)
     outcome = await first.client.call("echo")
     assert "old_epoch" in outcome.text and outcome.executed is Executed.NO

@@ -108,7 +108,7 @@ class GoodClient:
     async def begin(self) -> None:
         """Connect, and call from now on."""
         self.client.start()
-        assert await self.client.connected(20.0)
+        assert await self.client.connected(60.0)
         self._task = asyncio.create_task(self._call())
 
     async def _call(self) -> None:

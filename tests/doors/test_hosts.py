@@ -70,7 +70,7 @@ async def main():
     client = Client(sys.argv[1], int(sys.argv[2]), Caller("vision", hello, auto_ack=True), key=bytes.fromhex(sys.argv[3]))
     client.start()
     async with asyncio.timeout(60):
-        assert await client.connected(15)
+        assert await client.connected(60)
         echo, tune = await client.call("echo", {"n": 1}), await client.call("tune", {"n": 1})
     told = {"offers": client.caller.offers, "echo": echo.status, "tune": [tune.status, tune.cause, tune.executed]}
     print(json.dumps(told))

@@ -41,7 +41,7 @@ class GuardedOperator(Operator):
             client = Client(host, port, caller, on_notices=self._take, key=proves.key, tls=proves.client())
             self.clients[node] = client
             client.start()
-            assert await client.connected(20.0)
+            assert await client.connected(60.0)
 
 
 @pytest.mark.processes

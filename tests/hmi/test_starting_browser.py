@@ -219,7 +219,7 @@ async def test_the_emergency_stop_is_cleared_by_who_holds_the_controls(
     browser: Browser, page: Page, cell: Simulated, shots: Path, faults: Watch
 ) -> None:
     """It stands until then, whatever the run came to; nothing starts; clearing asks once more; keyboard alone."""
-    cell.tasks.save_text("long", None, TASK.replace("tokens = 2", "tokens = 9"))
+    cell.tasks.save_text("long", None, TASK.replace("[transitions.begin]", "[transitions.begin]\nafter = 3600.0"))
     ana, ben = await opened(browser, page), await opened(browser, page)
     complaints = faults(ana)
     dialog = await chosen(ana, "long")

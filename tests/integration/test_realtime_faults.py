@@ -61,7 +61,7 @@ async def arm_state(shell: RealtimeMission) -> dict[str, Any]:
             told.set_result(data["devices"]["arm"]["state"])
 
     shell.mission.executor.on_status = hear
-    assert await shell.clients["motion"].connected(30.0)
+    assert await shell.clients["motion"].connected(60.0)
     now = asyncio.get_running_loop().time()
     shell.mission.callers["motion"].command(now, Command("test/status", "status"))
     shell.clients["motion"].flush(now)
@@ -79,7 +79,7 @@ async def run_and_kill(
         killer = When(place, lambda: os.kill(supervisor.process_ids()[node], signal.SIGKILL))
         mission.executor.observers.append(killer)
         try:
-            await shell.connect(20.0)
+            await shell.connect(60.0)
             await asyncio.wait_for(shell.run(), LIMIT)
             arm = await arm_state(shell)
         finally:
@@ -125,7 +125,7 @@ async def test_every_firing_of_a_live_run_is_one_of_the_ordinary_net(tmp_path: P
     async with Supervisor(local_programs(directory), tmp_path / "logs"):
         shell = RealtimeMission(mission, directory)
         try:
-            await shell.connect(20.0)
+            await shell.connect(60.0)
             await asyncio.wait_for(shell.run(), LIMIT)
         finally:
             await shell.close()

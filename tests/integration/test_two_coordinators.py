@@ -31,7 +31,7 @@ async def led(directory: Directory, mission: Mission, meanwhile: asyncio.Event |
     """Connect, set `meanwhile`, run to the end, leave in good order."""
     shell = RealtimeMission(mission, directory)
     try:
-        await shell.connect(30.0)
+        await shell.connect(60.0)
         if meanwhile is not None:
             meanwhile.set()
         await asyncio.wait_for(shell.run(), LIMIT)
@@ -49,7 +49,7 @@ async def until_moving(folder: Path) -> None:
 async def test_the_second_coordinator_is_refused_until_the_first_has_gone(tmp_path: Path) -> None:
     """No device is shared, no run of the first one suffers, and whoever comes after it has the hands at once."""
     directory = load(shuttle_services(tmp_path, fetch=0.8, carry=0.8))
-    first, second, third = (mission_on(directory, runs) for runs in (6, 2, 2))
+    first, second, third = (mission_on(directory, runs) for runs in (10, 2, 2))
     async with Supervisor(local_programs(directory), tmp_path / "logs"):
         leading = asyncio.create_task(led(directory, first))
         await until_moving(tmp_path)
@@ -73,7 +73,7 @@ async def test_a_good_bye_whose_link_is_broken_is_said_over_another(tmp_path: Pa
     first, second = mission_on(directory, 2), mission_on(directory, 2)
     async with Supervisor(local_programs(directory), tmp_path / "logs"):
         shell = RealtimeMission(first, directory)
-        await shell.connect(30.0)
+        await shell.connect(60.0)
         await asyncio.wait_for(shell.run(), LIMIT)
         for client in shell.clients.values():
             assert client._link is not None

@@ -467,7 +467,7 @@ class Process:
 
     def end(self) -> None:
         self.node.close()
-        self.thread.join(10.0)
+        self.thread.join(60.0)
         self.descriptors.close()
         self._far.close()
         self._loop_end.close()
