@@ -38,6 +38,8 @@ from tests.waiting import beat
 
 MARK = "PETROBOT_STORM"
 """Environment variable that all processes of a storm carry."""
+LEAST_MISSIONS, LEAST_EVENTS = 3, 10
+"""What makes a storm, however long it takes."""
 LONGEST = 240.0
 """Seconds after which a mission run counts as hanging."""
 RUNS = 24
@@ -45,7 +47,7 @@ QUIET = ("--quiet", "--no-page")
 KILLS = 4
 """Times at most that the coordinator of one mission run is killed: it has to come to its end some day."""
 UNREACHABLE, HANGS = 3, 1000
-PATIENCE = 10.0
+PATIENCE = 60.0
 """Seconds that nodes have to notice that everybody has left."""
 
 
@@ -181,7 +183,7 @@ class Storm:
                 loop = asyncio.get_running_loop()
                 before, end = _sockets(supervisor), loop.time() + seconds
                 blowing = loop.create_task(weather.blow())
-                while loop.time() < end:
+                while loop.time() < end or (self._hardly(weather) and loop.time() < end + LONGEST):
                     await self._mission()
                 blowing.cancel()
                 await asyncio.gather(blowing, return_exceptions=True)
@@ -191,6 +193,10 @@ class Storm:
             proxy.stdin.close()
             await proxy.wait()
         return self._told(weather, left)
+
+    def _hardly(self, weather: Weather) -> bool:
+        """Whether too little has happened yet to be called a storm: a slow machine needs longer for that."""
+        return sum(self._ends.values()) < LEAST_MISSIONS or sum(weather.seen.values()) < LEAST_EVENTS
 
     def _told(self, weather: Weather, sockets: dict[str, int]) -> dict[str, Any]:
         begun = moves(self._folder, "begin")

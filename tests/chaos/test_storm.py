@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from tests.chaos.shuttle_cell import ROOT
+from tests.chaos.storm import LEAST_EVENTS, LEAST_MISSIONS
 
 pytestmark = pytest.mark.processes
 SHORT, LONG = 20.0, 600.0
@@ -32,7 +33,7 @@ def storm(folder: Path, seed: int, seconds: float, *, lo: bool = False) -> dict[
 def judge(told: dict[str, Any]) -> None:
     """All that must hold in any weather."""
     assert told["faults"] == []
-    assert told["missions"] >= 3 and sum(told["weather"].values()) >= 10, "hardly a storm"
+    assert told["missions"] >= LEAST_MISSIONS and sum(told["weather"].values()) >= LEAST_EVENTS, "hardly a storm"
     assert set(told["ends"]) <= {"success", "error"}
     assert told["twice"] == [], "an action was executed twice"
     assert told["overlaps"] == [], "two performers for one hand"
