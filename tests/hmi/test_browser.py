@@ -151,7 +151,7 @@ async def test_a_new_user_draws_runs_and_understands(
     await tab.screenshot(path=shots / "designer.png")
 
     await take_controls(tab)
-    stage.kept.add("look")
+    stage.kept.add("look__edges")
     await tab.get_by_role("button", name="Run this task").click()
     dialog = tab.get_by_role("dialog", name="Save the task as")
     await dialog.get_by_label("Name").fill("drawn")
