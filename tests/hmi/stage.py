@@ -291,6 +291,7 @@ class Stage:
     def _carry_out(self, instruction: Instruction) -> list[Stimulus]:
         match instruction:
             case StartRun(run, action=action):
+                assert self.kept <= self.where.keys(), "a run is kept by the name of its action"
                 self._playing[run] = _Playing(instruction, self._part(action))
                 return [RunStarted(run)]
             case CancelRun(run):
