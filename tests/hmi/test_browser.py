@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import re
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -288,6 +288,32 @@ async def test_operators_hand_on_the_net(browser: Browser, page: Page, stage: St
     assert verbs == [
         "take_controls", "breakpoint", "override_selector", "start", "raise_event", "force_exit", "abort",
     ]  # fmt: skip
+
+
+async def test_who_chooses_an_alternative_while_a_run_learns_goes_on_choosing(
+    browser: Browser, page: Page, stage: Stage
+) -> None:
+    """Probabilities alter under an open list; a choice that is refused does not stand there as if it had been taken."""
+    tab = await opened(browser, page)
+    await hold_controls(tab)
+    choose = tab.get_by_label("Alternative for look")
+    await choose.focus()
+    held = await choose.element_handle()
+    known = stage.feed.state["selectors"]["look"]
+    for share in (0.25, 0.75):
+        alternatives = [{**known["alternatives"][0], "probability": share}, *known["alternatives"][1:]]
+        stage.feed.emit("selector", time=stage.clock, name="look", selector={**known, "alternatives": alternatives})
+        await expect(tab.locator(".selector", has=choose)).to_contain_text(f"{round(100 * share)} %")
+    assert held is not None
+    assert await held.evaluate("(list) => list === document.activeElement")
+
+    async def refuse(who: str, data: Mapping[str, Any]) -> dict[str, Any]:
+        return {"ok": False, "code": "refused", "text": "not while it is frozen"}
+
+    stage.__dict__["_override_selector"] = refuse
+    await choose.select_option("look__template")
+    await expect(tab.get_by_text("not while it is frozen")).to_be_visible()
+    await expect(choose).to_have_value("")
 
 
 async def test_a_folded_error_branch_turns_red(browser: Browser, page: Page, stage: Stage, shots: Path) -> None:

@@ -8,6 +8,7 @@ import { icon } from "./icons.js";
 import { stateOf } from "./operator.js";
 import { Learning, objectives } from "./learning.js";
 import { Selected } from "./selected.js";
+import { Selectors } from "./selectors.js";
 import { alarmed, sheetOf, tokensOf, trailOf } from "./sheet.js";
 import { Timeline } from "./timeline.js";
 
@@ -28,7 +29,7 @@ export class Live {
     this.firings = panel("Last firings", h("ol", { class: "firings" }));
     this.press = new Press(this.firings.content);
     this.nodes = panel("Nodes", h("ul", { class: "nodes" }));
-    this.selectors = panel("Selectors", h("ul", { class: "selectors" }));
+    this.selectors = new Selectors(link, operator);
     this.result = h("section", { class: "result", role: "status", hidden: true });
     this.side = h("aside", { class: "side", "aria-label": "Mission details" }, this.result, this.selected.root, this.running.root, this.firings.root, this.selectors.root, this.nodes.root);
     this.dock = new Dock(link, (place) => this.canvas.goTo(place), () => this.paintHeat());
@@ -102,7 +103,7 @@ export class Live {
     if (dirty("runs")) this.paintCards();
     if (dirty("firings")) this.paintFirings(changed.has("all"));
     if (dirty("nodes")) this.paintNodes();
-    if (dirty("selectors")) this.paintSelectors();
+    if (dirty("selectors")) this.selectors.paint();
     if (dirty("selectors")) this.paintHeat();
     if (dirty("result", "mission")) this.paintResult();
     if (dirty("marking", "runs", "breakpoints", "events", "controls", "firings", "connection")) this.selected.update(this.link.state, this.link.now());
@@ -253,20 +254,6 @@ export class Live {
     this.dock.learning.update(this.link.state);
   }
 
-  paintSelectors() {
-    const list = Object.entries(this.link.state.selectors).filter(([, sel]) => (sel.alternatives ?? []).length > 1);
-    this.selectors.root.hidden = !list.length;
-    fill(this.selectors.content, list.map(([name, sel]) => this.selectorRow(name, sel)));
-  }
-
-  selectorRow(name, selector) {
-    const choose = h("select", { "aria-label": `Alternative for ${words(name)}`, disabled: !this.link.mayAct, onchange: (e) => this.operator.give("override_selector", { primitive_task: name, action: e.target.value || null }) },
-      h("option", { value: "" }, "learned choice"), selector.alternatives.map((a) => h("option", { value: a.action }, words(a.action))));
-    choose.value = selector.override ?? "";
-    const bars = selector.alternatives.map((a) => h("li", {}, h("span", {}, words(a.action)), h("meter", { min: 0, max: 1, value: a.probability ?? 0 }), h("span", { class: "number" }, a.probability !== undefined ? `${Math.round(a.probability * 100)} %` : "")));
-    return h("li", { class: "selector" }, h("div", { class: "line" }, h("strong", {}, words(name)), choose), h("ul", { class: "bars" }, bars));
-  }
-
   paintResult() {
     const { result, mission } = this.link.state;
     const over = ["success", "failure", "error", "aborted", "stopped"].includes(mission.state);
@@ -280,7 +267,7 @@ export class Live {
   }
 
   controlsChanged() {
-    this.paintSelectors();
+    this.selectors.paint();
     this.selected.update(this.link.state, this.link.now(), true);
   }
 

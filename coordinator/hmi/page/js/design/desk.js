@@ -57,7 +57,7 @@ export class Desk {
     this.put(task, task.own === false);
     this.designer.findings.take(task);
     await this.refresh();
-    this.designer.view.fit();
+    if (asked === this.documents) this.designer.view.fit(); // what was begun meanwhile stays where the hand is
     return true;
   }
 
@@ -140,7 +140,10 @@ export class Desk {
   }
 
   async importNow(file) {
-    if (!(await this.mayLeave())) return;
+    if (await this.mayLeave()) await this.designer.during(this.bringIn(file));
+  }
+
+  async bringIn(file) {
     const asked = ++this.documents;
     const made = await importNet(file.name.endsWith(".toml") ? "toml" : "pnml", await file.text());
     if (asked !== this.documents) return; // another document was asked for meanwhile
@@ -150,7 +153,7 @@ export class Desk {
     }
     this.put({ name: "", revision: null, document: made.document });
     await this.refresh();
-    this.designer.view.fit();
+    if (asked + 1 === this.documents) this.designer.view.fit(); // `put` counted once more
     toast("ok", `Imported ${file.name}; it is not saved yet`);
   }
 }
