@@ -41,7 +41,7 @@ export class Operator {
     };
     this.clear = button("clear_estop", "check", "Clear the stop", { hidden: true, onclick: () => this.clearStop() });
     this.options = h("button", { type: "button", class: "command", hidden: true, "aria-haspopup": "dialog", onclick: () => this.startWith() }, icon("more"), h("span", {}, "Start with"));
-    this.picker = h("select", { class: "pick-task", "aria-label": "Task to start", onchange: () => this.load(), onfocus: () => this.listTasks() });
+    this.picker = h("select", { class: "pick-task", "aria-label": "Task to start", onchange: () => (this.loading = this.load()), onfocus: () => this.listTasks() });
     this.controls = h("div", { class: "holder" });
     this.press = new Press(this.controls);
     this.answer = h("p", { class: "pause-note", role: "status" });
@@ -76,6 +76,7 @@ export class Operator {
 
   /** Ask how the run is to go before it is started. */
   async startWith() {
+    await this.loading; // of the task that was picked just now
     const { file } = this.link.state.mission;
     const about = file ? await startForm(file) : null;
     if (about) startDialog(about, file, (data) => this.give("start", data, false, true));
