@@ -241,18 +241,19 @@ def _pair(option: str, text: str) -> tuple[str, str]:
 def text_of(result: dict[str, Any]) -> str:
     """The result for people."""
     lines = [f"{result['task']}: {result['begun']} runs, selector {result['selector']}, seed {result['seed']}"]
+    wide = max(16, *(len(name) + 2 for name in (*result["by_regime"], *result["chosen"])))
     for name, part in [*result["by_regime"].items(), ("all", result)]:
         low, high = part["wilson"]
         goal = "" if part["R_goal"] is None else f"R_goal {part['R_goal']:.4f} [{low:.4f}, {high:.4f}]  "
         times = "" if part["mean"] is None else f"  mean {part['mean']:.3f} s, 90 % {part['q90']:.3f} s"
-        lines.append(f"  {name or '-':16}{goal}P_complete {part['P_complete'] or 0.0:.4f}{times}")
+        lines.append(f"  {name or '-':{wide}}{goal}P_complete {part['P_complete'] or 0.0:.4f}{times}")
     for task, actions in result["chosen"].items():
         if len(actions) > 1:
             judged = result["J"].get(task, {})
             shown = ", ".join(
                 f"{a} {n}" + (f" (J {judged[a]:.3f})" if judged.get(a) is not None else "") for a, n in actions.items()
             )
-            lines.append(f"  {task:16}{shown}")
+            lines.append(f"  {task:{wide}}{shown}")
     speed = result["times_real_time_per_core"]
     lines.append(f"  {result['sim_s']:.1f} s simulated in {result['wall_s']:.1f} s: {speed} x real time a core")
     lines.append(f"  table: {result['rows']}")

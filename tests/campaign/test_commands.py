@@ -21,6 +21,7 @@ from coordinator.campaign.conduct import Progress
 from coordinator.campaign.lock import held
 from coordinator.campaign.progress import ProgressLine, clock, line
 from coordinator.cli import main
+from coordinator.cli.campaign import text_of
 from tests.campaign.conftest import HERE, SERVICES, TASK
 
 ROOT = HERE.parents[1]
@@ -144,6 +145,21 @@ def test_a_killed_campaign_goes_on(tmp_path: Path) -> None:
     assert table.read_bytes() == (tmp_path / "whole" / "table.csv").read_bytes()
     sessions = (tmp_path / "part" / "sessions.csv").read_text(encoding="utf-8").splitlines()
     assert len(sessions) == 3  # the killed one is known, too
+
+
+def test_names_longer_than_their_column_stand_apart_from_what_follows() -> None:
+    """Regimes with several disturbances are long."""
+    part = {"R_goal": 0.75, "wilson": [0.6, 0.9], "P_complete": 1.0, "mean": 4.0, "q90": 5.0}
+    result = {"task": "t", "begun": 4, "selector": "fixed", "seed": 1, "sim_s": 1.0, "wall_s": 1.0, "rows": "table.csv"}
+    result |= {
+        "by_regime": {"C+arm50+latency200": part},
+        "chosen": {},
+        "J": {},
+        "times_real_time_per_core": 1.0,
+        **part,
+    }
+    rows = [line.split() for line in text_of(result).splitlines()[1:3]]
+    assert [row[:3] for row in rows] == [["C+arm50+latency200", "R_goal", "0.7500"], ["all", "R_goal", "0.7500"]]
 
 
 @pytest.mark.processes
