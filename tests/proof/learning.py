@@ -143,7 +143,7 @@ def forecast(sizes: Sizes, options: argparse.Namespace) -> Result:
     regimes = options.regimes
     count = len(regimes.split(","))
     campaign(sizes, "train", sizes.of(options.training) * count, 70, regimes)
-    registered = sizes.folder / "forecast.json"
+    registered = sizes.folder / "registered.json"
     if not registered.exists():
         runs = str(sizes.of(options.runs))
         petrobot(
@@ -163,22 +163,21 @@ def forecast(sizes: Sizes, options: argparse.Namespace) -> Result:
 
 def page(results: Mapping[str, Result], sizes: Sizes) -> str:
     """The tables, with the command that remakes them."""
-    share = "" if sizes.share == 1 else f" --share {sizes.share:g}"
     lines = [f"# Learning and forecasting, {sizes.task}: figures", ""]
-    lines += [f"Written by `python -m tests.proof.learning{share} --workers {sizes.workers}`; what is meant stands in"]
-    lines += ["[campaigns.md](campaigns.md) and [forecast.md](forecast.md).", ""]
+    lines += ["What is meant stands in [campaigns.md](campaigns.md) and [forecast.md](forecast.md).", ""]
     if "learn" in results:
         found = results["learn"]
-        lines += [f"## Learned, frozen, judged on fresh throws of {found['regime']}", ""]
+        lines += [f"## Learned, frozen, judged on fresh throws of {found['regime']}", "", f"`{found['command']}`", ""]
         lines += [_told(found), ""]
         lines += [*_turned(found["rows"]), ""]
     if "speed" in results:
-        found = {k: v for k, v in results["speed"].items() if k != "holds"}
-        lines += ["## Speed, memory, interruption", "", _verdict(results["speed"]), "", *_turned([found]), ""]
+        found = {k: v for k, v in results["speed"].items() if k not in ("holds", "command")}
+        lines += ["## Speed, memory, interruption", "", f"`{results['speed']['command']}`", ""]
+        lines += [_verdict(results["speed"]), "", *_turned([found]), ""]
     if "forecast" in results:
         found = results["forecast"]
         rejected = ", ".join(found["product_rejected"]) or "no regime"
-        lines += ["## Forecast and measurement", "", _verdict(found), "", found["page"]]
+        lines += ["## Forecast and measurement", "", f"`{found['command']}`", "", _verdict(found), "", found["page"]]
         lines += [f"The product rule is rejected in {rejected}.", ""]
     return "\n".join(lines)
 
@@ -262,9 +261,13 @@ def _kept(step: str, options: argparse.Namespace) -> Result:
     """Measure a step in full, and keep its result for the page."""
     sizes = Sizes(1.0, options.workers, FULL)
     sizes.folder.mkdir(parents=True, exist_ok=True)
-    result = STEPS[step](sizes, options)
+    result = STEPS[step](sizes, options) | {"command": _command([step])}
     (sizes.folder / f"{step}.json").write_text(json.dumps(result, indent=2), encoding="utf-8")
     return result
+
+
+def _command(argv: Sequence[str]) -> str:
+    return " ".join(["python -m tests.proof.learning", *argv])
 
 
 def _learn_line(found: Result) -> Result:
@@ -280,7 +283,8 @@ def _learn_line(found: Result) -> Result:
 
 
 def _speed_line(found: Result) -> Result:
-    return {"all that was promised": found["holds"], **{k: v for k, v in found.items() if k != "holds"}}
+    said = {k: v for k, v in found.items() if k not in ("holds", "command")}
+    return {"all that was promised": found["holds"], **said}
 
 
 def _forecast_line(found: Result) -> Result:
@@ -324,7 +328,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     results: dict[str, Result] = {}
     for name in options.steps or STEPS:
         print(f"{name} ...", flush=True)
-        results[name] = STEPS[name](sizes, options)
+        results[name] = STEPS[name](sizes, options) | {"command": _command(argv or sys.argv[1:])}
         (sizes.folder / f"{name}.json").write_text(json.dumps(results[name], indent=2), encoding="utf-8")
         print(f"{name}: {'holds' if results[name]['holds'] else 'DOES NOT HOLD'}", flush=True)
     full = sizes.share == 1 and options.task == "catch_ball"
