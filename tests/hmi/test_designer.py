@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import re
+import shutil
 from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
@@ -29,6 +30,7 @@ from playwright.async_api import Page as Tab
 
 pytestmark = [pytest.mark.asyncio(loop_scope="module"), pytest.mark.usefixtures("_windows_are_closed")]
 DRAWING = "Drawing of the task"
+SHIPPED = Path(__file__).parents[2] / "coordinator" / "tasks" / "catch_ball.toml"
 expect.set_options(timeout=PATIENCE_MS)
 
 
@@ -112,6 +114,24 @@ async def save(tab: Tab) -> None:
 
 
 # ---- arranging --------------------------------------------------------------------------------------------------------
+
+
+async def test_a_task_that_is_opened_is_seen_whole(browser: Browser, page: Page, tasks: Path) -> None:
+    """Every element with its words and arcs within the drawing, no field beyond the form, on a laptop's screen."""
+    shutil.copy(SHIPPED, tasks)
+    tab, complaints = await designing(browser, page, "catch_ball")
+    beyond = """(drawing) => {
+      const all = drawing.getBoundingClientRect();
+      return [...drawing.querySelectorAll("[data-name], [data-name] text, path")].filter((one) => {
+        const box = one.getBoundingClientRect();
+        return box.width && (box.left < all.left || box.right > all.right || box.top < all.top || box.bottom > all.bottom);
+      }).map((one) => one.dataset.name ?? one.textContent);
+    }"""
+    drawing = tab.get_by_role("application", name=DRAWING)
+    assert await drawing.locator("[data-name]").count() > 20
+    assert await drawing.evaluate(beyond) == []
+    assert await properties(tab).evaluate("(form) => form.scrollWidth - form.clientWidth") == 0
+    assert complaints == []
 
 
 async def test_chosen_elements_are_put_in_order(browser: Browser, page: Page, tasks: Path) -> None:

@@ -122,7 +122,7 @@ const DRAWN = ["fill", "fill-opacity", "stroke", "stroke-width", "stroke-dasharr
 
 /** The drawing of a view as an SVG text of its own: styles written out, in light colours, nothing but the net. */
 export function svgOf(view) {
-  const box = view.box ?? [0, 0, 100, 100];
+  const box = view.extent ?? [0, 0, 100, 100];
   const theme = document.documentElement.dataset.theme;
   document.documentElement.dataset.theme = "light";
   const clone = view.svg.cloneNode(true);

@@ -367,6 +367,13 @@ export class NetView {
     return bounds([...this.elements.values()].filter((e) => !this.isFolded(e)));
   }
 
+  /** `box` with all that is written and led beyond it. Reads what has been laid out: not for every change. */
+  get extent() {
+    const { box } = this;
+    const { x, y, width, height } = this.worlds[0].getBBox();
+    return box && [Math.min(box[0], x), Math.min(box[1], y), Math.max(box[2], x + width), Math.max(box[3], y + height)];
+  }
+
   resized() {
     const { clientWidth: w, clientHeight: h } = this.svg;
     if ((!this.size || this.view === this.fitted) && w && this.elements.size) this.fit(); // nobody has moved or zoomed it
@@ -375,7 +382,7 @@ export class NetView {
   }
 
   fit() {
-    const box = this.box;
+    const box = this.extent;
     const { clientWidth: w, clientHeight: h } = this.svg;
     if (!box || !w || !h) return;
     const top = 46; // the bar lies over the drawing

@@ -16,11 +16,12 @@ export class Desk {
     return this.designer.model;
   }
 
-  /** Put a document on the desk in the place of what lay there. */
+  /** Put a document on the desk in the place of what lay there; gives its number. */
   put(task, isShipped = false) {
     this.documents += 1;
     this.isShipped = isShipped;
     this.model.load(task);
+    return this.documents;
   }
 
   /** The first time that the designer is shown: the task that runs, or the first one, unless something else was begun. */
@@ -54,10 +55,10 @@ export class Desk {
       this.designer.bar.paint();
       return false;
     }
-    this.put(task, task.own === false);
+    const put = this.put(task, task.own === false);
     this.designer.findings.take(task);
     await this.refresh();
-    if (asked === this.documents) this.designer.view.fit(); // what was begun meanwhile stays where the hand is
+    if (put === this.documents) this.designer.view.fit(); // what was begun meanwhile stays where the hand is
     return true;
   }
 
@@ -151,9 +152,9 @@ export class Desk {
       this.designer.bar.paint();
       return;
     }
-    this.put({ name: "", revision: null, document: made.document });
+    const put = this.put({ name: "", revision: null, document: made.document });
     await this.refresh();
-    if (asked + 1 === this.documents) this.designer.view.fit(); // `put` counted once more
+    if (put === this.documents) this.designer.view.fit();
     toast("ok", `Imported ${file.name}; it is not saved yet`);
   }
 }
