@@ -20,6 +20,7 @@ import pytest
 from coordinator.campaign.conduct import Progress
 from coordinator.campaign.lock import held
 from coordinator.campaign.progress import ProgressLine, clock, line
+from coordinator.campaign.spent import times
 from coordinator.cli import main
 from coordinator.cli.campaign import text_of
 from tests.campaign.conftest import HERE, SERVICES, TASK
@@ -183,9 +184,8 @@ def test_no_worker_outlives_a_killed_campaign(tmp_path: Path) -> None:
         [*command, "--out", "part"], cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
     try:
-        _until(lambda: len(_children(campaign.pid)) == 2)
+        _until(lambda: _frozen_with_its_workers_at_work(campaign, tmp_path / "part"))
         workers = [os.pidfd_open(pid) for pid in _children(campaign.pid)]
-        _until(lambda: (tmp_path / "part" / "table.csv").exists())
         for worker in workers:
             signal.pidfd_send_signal(worker, signal.SIGSTOP)
     finally:
@@ -197,6 +197,18 @@ def test_no_worker_outlives_a_killed_campaign(tmp_path: Path) -> None:
             signal.pidfd_send_signal(worker, signal.SIGKILL)
         os.close(worker)
     assert gone == [True, True]
+
+
+def _frozen_with_its_workers_at_work(campaign: subprocess.Popen[bytes], folder: Path) -> bool:
+    """Freeze a campaign that has two workers, neither of them a new one still on its way to its first block."""
+    assert campaign.poll() is None
+    campaign.send_signal(signal.SIGSTOP)
+    os.waitid(os.P_PID, campaign.pid, os.WSTOPPED)
+    known, there = {int(row["worker"]) for row in times(folder)}, _children(campaign.pid)
+    if len(there) == 2 and known.issuperset(there):
+        return True
+    campaign.send_signal(signal.SIGCONT)
+    return False
 
 
 def _children(parent: int) -> list[int]:
