@@ -1,4 +1,4 @@
-"""The camera's primitive actions: locate a rolling ball in four ways, track it and predict where it leaves in three ways.
+"""The camera's primitive actions: locate a rolling ball in five ways, track it and predict where it leaves in three ways.
 
 Every locator gives `ball`, plain data with which every tracker goes on: `places` rows [dt, x, y] (s relative to the image
 `sequence`, m, base frame), their accuracy `sigma` (m), and the `age` (s) of that image when the locator ended.
@@ -12,13 +12,24 @@ from typing import Any
 from services.action import Context, Result
 from services.vision.camera import Camera
 from services.vision.locating import LocateSpecification, locate
-from services.vision.location import BackgroundSubtraction, Detector, FixedThreshold, HoughCircles, MixtureOfGaussians
+from services.vision.location import (
+    BackgroundSubtraction,
+    CompensatedSubtraction,
+    Detector,
+    FixedThreshold,
+    HoughCircles,
+    MixtureOfGaussians,
+)
 from services.vision.prediction import ConstantVelocity, Kalman, LeastSquares, Predictor, Surface
 from services.vision.tracking import TrackSpecification, track
 
 
 def _background(camera: Camera) -> Detector:
     return BackgroundSubtraction(camera.view, camera.background)
+
+
+def _compensated(camera: Camera) -> Detector:
+    return CompensatedSubtraction(camera.view, camera.background)
 
 
 def _mog2(camera: Camera) -> Detector:
@@ -57,6 +68,12 @@ async def locate_threshold(ctx: Context, **options: float) -> Result:
     """Locate a rolling ball as what is brighter than one grey level: cheapest, fails in uneven or dim light. As
     `locate_background`."""
     return await locate(ctx, "threshold", _threshold, 0.0015, LocateSpecification.of(options))
+
+
+async def locate_compensated(ctx: Context, **options: float) -> Result:
+    """Locate a rolling ball by subtracting the stored picture, scaled to the light of each image: as accurate, also where the
+    lamps beat or were switched. As `locate_background`."""
+    return await locate(ctx, "compensated", _compensated, 0.0007, LocateSpecification.of(options))
 
 
 async def _predict(

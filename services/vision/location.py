@@ -1,4 +1,4 @@
-"""Where the ball is in an image: four detectors over the whole table that differ in what they cost and what deceives them,
+"""Where the ball is in an image: five detectors over the whole table that differ in what they cost and what deceives them,
 and the measurement in a small window with which a known ball is tracked.
 
 Every detector takes an image (height, width) uint8 and gives candidates (n, 2): the ball's centre in pixels. They keep state
@@ -140,14 +140,31 @@ class BackgroundSubtraction(_WholeTable):
             return NOTHING
         if picture is not self._halved:  # a new one each time it learns
             self._halved, self._half_picture = picture, self.half(picture)
-        brighter = cv2.subtract(self.half(pixels), self._half_picture)
-        mask = cv2.threshold(brighter, self.THRESHOLD, 255, cv2.THRESH_BINARY)[1]
         found = []
-        for centre in self.blobs(np.asarray(mask, np.uint8)):
+        for centre in self.blobs(self._mask(self.half(pixels), self._half_picture)):
             seen = self._window.measure(pixels, picture, centre, streak=self.view.streak_px(FASTEST))
             if seen is not None:
                 found.append(seen.centre)
         return np.array(found) if found else NOTHING
+
+    def _mask(self, half: Pixels, empty: Pixels) -> Pixels:
+        """Where an image is brighter than the empty table (0 or 255), both at half size."""
+        brighter = cv2.subtract(half, empty)
+        return np.asarray(cv2.threshold(brighter, self.THRESHOLD, 255, cv2.THRESH_BINARY)[1], np.uint8)
+
+
+class CompensatedSubtraction(BackgroundSubtraction):
+    """What is brighter than the stored picture in the light of this very image: the picture is scaled by how much brighter the
+    whole table has become. Stands light that beats, switches or drifts, as long as all of the table is lit alike."""
+
+    LEAST_THRESHOLD = 10.0
+    """Grey levels: 6 sigma of the half-size noise."""
+
+    def _mask(self, half: Pixels, empty: Pixels) -> Pixels:
+        gain = _median(half) / max(_median(empty), 1.0)
+        brighter = cv2.subtract(half, cv2.convertScaleAbs(empty, alpha=gain))
+        threshold = max(self.THRESHOLD * gain, self.LEAST_THRESHOLD)
+        return np.asarray(cv2.threshold(brighter, threshold, 255, cv2.THRESH_BINARY)[1], np.uint8)
 
 
 class MixtureOfGaussians(_WholeTable):

@@ -66,7 +66,7 @@ def campaign(sizes: Sizes, name: str, throws: int, seed: int, regime: str, *more
     path = folder / "result.json"
     if path.exists() and json.loads(path.read_text(encoding="utf-8"))["begun"]:
         kept: Result = json.loads(path.read_text(encoding="utf-8"))
-        if kept["runs"] == throws and kept["seed"] == seed:
+        if (kept["runs"], kept["seed"], ",".join(kept["regimes"])) == (throws, seed, regime):
             return kept
     print(f"  {name}: {throws} throws of {regime}, seed {seed}", flush=True)
     given = ("--runs", str(throws), "--seed", str(seed), "--regime", regime, "--out", str(folder))

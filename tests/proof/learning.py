@@ -154,7 +154,8 @@ def forecast(sizes: Sizes, options: argparse.Namespace) -> Result:
     told = ("--compare", str(registered), str(sizes.folder / "new"), "--markdown", str(page), "--json", str(numbers))
     petrobot("forecast", *told, codes=(0, 1))
     found: Result = json.loads(numbers.read_text(encoding="utf-8"))
-    holds = found["agrees"] and found["equivalent"] and found["registered_before"]
+    right = found["agrees"] and found["equivalent"] and found["registered_before"]
+    holds = right and bool(found["product_rejected"])
     return {**found, "page": page.read_text(encoding="utf-8"), "holds": holds}
 
 
@@ -308,10 +309,10 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--task", default="catch_ball", metavar="TASK", help="(%(default)s)")
     made.add_argument("--services", type=Path, metavar="FILE", help="its location file (the shipped one)")
     made.add_argument("--page", type=Path, metavar="FILE", help="docs/figures-learning.md in the full proof")
-    made.add_argument("--disturbed", default="B+dim", metavar="REGIME", help="in which is learned (%(default)s)")
+    made.add_argument("--disturbed", default="C+beating", metavar="REGIME", help="in which is learned (%(default)s)")
     made.add_argument("--selector", default="nikolic_fu_fast", metavar="NAME")
     made.add_argument("--seeds", type=int, default=5, metavar="N", help="learning seeds (%(default)s)")
-    made.add_argument("--regimes", default="A,B,C", metavar="A,B", help="that are forecast (%(default)s)")
+    made.add_argument("--regimes", default="A,B,C,C+beating", metavar="A,B", help="that are forecast (%(default)s)")
     made.add_argument("--training", type=int, default=2000, metavar="N", help="throws a regime (%(default)s)")
     made.add_argument("--runs", type=int, default=1000, metavar="N", help="new throws a regime (%(default)s)")
     return made

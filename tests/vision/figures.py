@@ -25,7 +25,7 @@ from tests.vision.bench import ROOT, Array, Bench, BenchContext, BenchPorts, dra
 
 PICTURE = ROOT / "docs" / "pictures" / "camera.png"
 ENLARGED = 1.5
-LOCATORS = ("background", "mog2", "hough", "threshold")
+LOCATORS = ("background", "mog2", "hough", "threshold", "compensated")
 PREDICTORS: dict[str, Callable[[Surface], Predictor]] = {
     "constant_velocity": ConstantVelocity,
     "least_squares": LeastSquares,
@@ -35,6 +35,7 @@ LIGHTS: dict[str, Callable[[float], float]] = {
     "nominal": lambda time: 1.0,
     "drift": lambda time: 1.0 + 0.35 * float(np.sin(2.0 * np.pi * time / 8.0)),
     "dim": lambda time: 0.6,
+    "beating": lambda time: 1.0 + 0.6 * float(np.sin(2.0 * np.pi * time)),
 }
 
 
@@ -110,7 +111,14 @@ def print_tables(camera: PinholeCamera) -> None:
     """The tables of docs/vision.md."""
     print("locator, light, regime | ends of 20 | ms an image | ms a simulated second | residual mm")
     for locator in LOCATORS:
-        for light, regime in (("nominal", "A"), ("nominal", "C"), ("drift", "A"), ("dim", "A")):
+        for light, regime in (
+            ("nominal", "A"),
+            ("nominal", "C"),
+            ("drift", "A"),
+            ("dim", "A"),
+            ("beating", "A"),
+            ("beating", "C"),
+        ):
             located, _, _ = throws(camera, locator, "least_squares", regime, light, 20)
             print(f"{locator}, {light}, {regime} | {located.row()}")
     print("\npredictor, regime | ends of 20 | ms an image | ms a simulated second | - | rms at 0.45 s: ms, mm")

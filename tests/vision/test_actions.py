@@ -19,6 +19,7 @@ LOCATORS = {
     "mog2": actions.locate_mog2,
     "hough": actions.locate_hough,
     "threshold": actions.locate_threshold,
+    "compensated": actions.locate_compensated,
 }
 PREDICTORS = {
     "least_squares": actions.predict_least_squares,
@@ -217,6 +218,20 @@ def test_threshold_fails_in_dim_light_and_the_others_do_not(context: BenchContex
         run_action(bench, _pause(context, 2.0))
     assert outcomes.pop("threshold") is Status.ERROR
     assert Status.ERROR not in outcomes.values()
+
+
+def test_beating_lamps_make_the_stored_background_late_and_the_compensated_one_not(context: BenchContext) -> None:
+    """Released at eight phases of a light that goes up and down by 60 % once a second."""
+    bench, late = context.bench, dict.fromkeys(("background", "compensated"), 0)
+    bench.light = lambda time: 1.0 + 0.6 * float(np.sin(2.0 * np.pi * time))
+    for name in late:
+        for phase in range(8):
+            run_action(bench, _pause(context, 2.0 - bench.now % 1.0 + phase / 8))
+            bench.ball, bench.release = Ball((2.12, 0.1), (0.62, 0.0), 2.3), bench.now + 0.4
+            located = run_action(bench, LOCATORS[name](context, timeout=2.5))
+            late[name] += located.status is not Status.SUCCESS
+            context.device.end()
+    assert late["compensated"] == 0 < late["background"]
 
 
 async def _pause(context: BenchContext, seconds: float) -> Result:
