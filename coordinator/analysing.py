@@ -1,6 +1,7 @@
 """Verdicts on a task that is being drawn, for the designer. `python -m coordinator.analysing` reads the task's text.
 
 A process of its own, below all others in priority and with a hard end: a search never takes time from a mission that goes on.
+Its ends are counted in processor time, so that what is said of a drawing does not depend on what else the machine does.
 """
 
 from __future__ import annotations
@@ -9,14 +10,17 @@ import asyncio
 import contextlib
 import json
 import os
+import resource
 import sys
 import time
 from typing import Any
 
 STATES, SECONDS, MEMORY = 50_000, 4.0, 256 << 20
-"""What one state space may take: markings, seconds, bytes."""
-HARD_END = 8.0
-"""Seconds after which the process is killed, whatever it does; what it has said by then counts."""
+"""What one state space may take: markings, seconds of processor time, bytes."""
+HARD_END = 8
+"""Seconds of processor time after which the kernel kills the process, whatever it does; what it has said by then counts."""
+PATIENCE = 120.0
+"""Seconds until one that gets no processor time is given up."""
 LONGEST_LINE = 16 << 20
 LOWER = 10
 """How much below others it runs (nice)."""
@@ -52,7 +56,7 @@ async def analyse_apart(text: str, filename: str) -> dict[str, Any]:
         process.stdin.write(text.encode())
         process.stdin.close()
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(HARD_END):
+            async with asyncio.timeout(PATIENCE):
                 while line := await process.stdout.readline():
                     newest = line
                 complaint = await process.stderr.read()
@@ -77,7 +81,7 @@ def analysed(text: str, filename: str, view: str = "ordinary") -> dict[str, Any]
     from coordinator.analysis.space import Limits
     from coordinator.taskfile import loads
 
-    limits = Limits(states=STATES, seconds=SECONDS, memory=MEMORY, clock=time.monotonic)
+    limits = Limits(states=STATES, seconds=SECONDS, memory=MEMORY, clock=time.process_time)
     analysis = analyse(loads(text, filename), view=view, limits=limits)
     space = analysis.qualitative.space
     verdicts = [
@@ -104,6 +108,7 @@ def analysed(text: str, filename: str, view: str = "ordinary") -> dict[str, Any]
 def main() -> int:
     """Read a task on standard input, write what is to be said of it as lines of JSON, the last the fullest."""
     os.nice(LOWER)
+    resource.setrlimit(resource.RLIMIT_CPU, (HARD_END, HARD_END))
     try:
         text = sys.stdin.read()
         for view in ("ordinary", "gspn"):  # verdicts first: a forecast may take long
