@@ -23,7 +23,7 @@ from coordinator.taskfile import load
 from services.action import Status as ActionStatus
 from services.scripted import Line
 from tests.campaign.conftest import TASK
-from tests.coordinator.scripted_cell import directory_for, scripts
+from tests.mission.scripted_cell import directory_for, scripts
 
 TOY = load(TASK)
 

@@ -1,7 +1,7 @@
 """Races by name: two things that cross on their way, in either order. Each has one right outcome, and tokens stay whole.
 
 Where other coordination systems got one of them wrong, the name of the trouble is in the test; all of them by name, over a node,
-in tests/coordinator/test_named_races.py.
+in tests/mission/test_named_races.py.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from coordinator.cli import main
 from coordinator.record.journal import JournalWriter, read_journal
 from coordinator.record.recording import ReplayError, RetracingStore
 from coordinator.record.runfolder import JOURNAL, RESULT
-from tests.coordinator.test_runfolder import SCRIPT, SERVICES
+from tests.record.test_runfolder import SCRIPT, SERVICES
 
 TASK = Path(__file__).parents[1] / "chaos" / "shuttle.toml"
 

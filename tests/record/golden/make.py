@@ -1,7 +1,7 @@
-"""Makes the golden journals anew: `python -m tests.coordinator.golden.make`. Do it only when the semantics are meant to change.
+"""Makes the golden journals anew: `python -m tests.record.golden.make`. Do it only when the semantics are meant to change.
 
 Each is a mission run of a shipped task in lock step with scripted actions. The tests derive every marking and instruction of them
-again (tests/coordinator/test_golden.py), so a change that no version of petrobot may make by accident is noticed.
+again (tests/record/test_golden.py), so a change that no version of petrobot may make by accident is noticed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from coordinator.record.runfolder import header
 from services.action import Status
 from services.comm.directory import parse
 from services.scripted import Line
-from tests.coordinator.scripted_cell import scripts, services_text
+from tests.mission.scripted_cell import scripts, services_text
 
 FOLDER = Path(__file__).parent
 GOOD = Line(seconds=(0.2, 0.2))

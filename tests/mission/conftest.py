@@ -1,4 +1,4 @@
-"""What the tests of the coordinator share: the shipped task."""
+"""What the tests of a mission share: the shipped task."""
 
 from __future__ import annotations
 

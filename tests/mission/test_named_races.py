@@ -13,7 +13,7 @@ from coordinator.mission.dispatch import ESCALATION
 from coordinator.mission.fences import STOP_MARGIN
 from coordinator.task import Executed, Status
 from services.comm import messages as m
-from tests.coordinator.toy_arm import TIDY, WORK, Bench
+from tests.mission.toy_arm import TIDY, WORK, Bench
 
 STOPPED = "preempted by rung"
 

@@ -17,7 +17,7 @@ from coordinator.launch import resumed_mission
 from coordinator.record.journal import MAGIC, PREFIX, JournalError, JournalWriter, read_journal
 from coordinator.record.recording import JournalStore, ReplayError
 from services.comm import messages as m
-from tests.coordinator.toy_arm import WORK, Bench
+from tests.mission.toy_arm import WORK, Bench
 
 GOLDEN = Path(__file__).parent / "golden" / "catch_ball-missed-and-recovered.journal"
 

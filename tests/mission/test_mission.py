@@ -13,7 +13,7 @@ from coordinator.record.timeline import Timeline
 from coordinator.task import Status, Task
 from services.action import Status as ActionStatus
 from services.scripted import Line
-from tests.coordinator.scripted_cell import directory_for, scripts
+from tests.mission.scripted_cell import directory_for, scripts
 
 
 def run(task: Task, lines: dict[str, list[Line]], **given: Any) -> tuple[Mission, Timeline]:

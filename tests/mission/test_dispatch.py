@@ -14,7 +14,7 @@ from coordinator.record.journal import JournalError, JournalWriter
 from coordinator.record.recording import JournalStore
 from coordinator.task import Executed, Status
 from services.comm import messages as m
-from tests.coordinator.toy_arm import TIDY, WORK, Bench
+from tests.mission.toy_arm import TIDY, WORK, Bench
 
 STOPPED = "preempted by rung"
 WITHIN = 1.0

@@ -10,7 +10,7 @@ from coordinator.cli.replaying import recorded
 from coordinator.engine import Engine, Finished, Fired, State
 from coordinator.record.journal import read_journal
 from coordinator.record.recording import ReplayError, replay
-from tests.coordinator.golden.make import STORIES, make
+from tests.record.golden.make import STORIES, make
 
 GOLDEN = Path(__file__).parent / "golden"
 ENDS = {

@@ -22,7 +22,7 @@ from coordinator.task import Task
 from coordinator.taskfile import load
 from services.comm.directory import Directory, parse
 from services.scripted import load as script_of
-from tests.coordinator.test_runfolder import SCRIPT, SERVICES
+from tests.record.test_runfolder import SCRIPT, SERVICES
 
 TASK = Path(__file__).parents[1] / "chaos" / "shuttle.toml"
 TICKS = 20_000

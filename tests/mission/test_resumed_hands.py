@@ -8,7 +8,7 @@ from coordinator.engine import Abort, Hold, Mode, Pause, Resume, RunHeld, SetBre
 from coordinator.mission.fences import STOP_MARGIN
 from coordinator.task import Executed, Status
 from services.comm import messages as m
-from tests.coordinator.toy_arm import TIDY, WORK, Bench
+from tests.mission.toy_arm import TIDY, WORK, Bench
 
 
 def held(bench: Bench, now: float) -> m.Command:

@@ -21,7 +21,7 @@ from coordinator.task import Status, Task
 from services.action import Status as ActionStatus
 from services.comm.cell import Cell
 from services.scripted import Line
-from tests.coordinator.scripted_cell import directory_for, scripts
+from tests.mission.scripted_cell import directory_for, scripts
 
 LINES = {
     "locate_ball": [Line(seconds=(0.2, 0.2), values={"ball": [1.0, 0.1]})],
