@@ -5,9 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import re
-from collections.abc import AsyncIterator, Callable, Mapping
-from contextlib import asynccontextmanager
-from itertools import pairwise
+from collections.abc import AsyncIterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +17,12 @@ from coordinator.hmi.changes import apply, empty_state
 from coordinator.hmi.server import Page, start_page
 from coordinator.hmi.sessions import Session
 from coordinator.task import Executed, Status
-from coordinator.taskfile import load
 from tests.bench.hmi import SyntheticMission, ticking
 from tests.hmi.conftest import (
     PATIENCE_MS,
     abort,
     browser_missing,
     nobody_listens,
-    note_toasts,
     served,
     staged,
     toasted,
@@ -38,13 +34,24 @@ from tests.hmi.test_changes import changes
 if browser_missing() and os.environ.get("CI") != "true":
     pytest.skip(browser_missing(), allow_module_level=True)
 
-from playwright.async_api import Browser, Locator, Route, expect
+from playwright.async_api import Browser, expect
 from playwright.async_api import Page as Tab
 
+from tests.hmi.steps import (
+    Watch,
+    checked,
+    designer,
+    draw_the_task,
+    element,
+    hold_controls,
+    opened,
+    pressed,
+    settled,
+    start_mission,
+    take_controls,
+)
+
 pytestmark = [pytest.mark.asyncio(loop_scope="module"), pytest.mark.usefixtures("_windows_are_closed")]
-Watch = Callable[[Any], list[str]]
-SIZE = {"width": 1440, "height": 900}
-expect.set_options(timeout=PATIENCE_MS)
 
 
 @pytest_asyncio.fixture(loop_scope="module")
@@ -59,82 +66,6 @@ async def page(stage: Stage, tasks: Path, tmp_path: Path) -> AsyncIterator[Page]
     """Its page."""
     async with served(stage, tasks, tmp_path / "runs") as made:
         yield made
-
-
-async def opened(browser: Browser, page: Page, theme: str = "light") -> Tab:
-    """A new window on the page, as a new person would open it."""
-    context = await browser.new_context(viewport=SIZE, color_scheme=theme, reduced_motion="no-preference")  # type: ignore[arg-type]
-    context.set_default_timeout(PATIENCE_MS)
-    tab = await context.new_page()
-    await tab.goto(page.url)
-    await expect(tab.get_by_role("button", name="Emergency stop")).to_be_visible()
-    await note_toasts(tab)
-    return tab
-
-
-async def settled(tab: Tab) -> None:
-    """The designer has opened what it was asked to open: nothing moves there any more by itself."""
-    await expect(tab.locator(".designer")).not_to_have_attribute("aria-busy", "true")
-
-
-async def checked(tab: Tab, said: str = "May run") -> None:
-    """The server has checked what is drawn now, and says so; before, the list says what was found in what was drawn then."""
-    findings = tab.get_by_role("region", name="Findings")
-    await expect(findings).not_to_have_attribute("aria-busy", "true")
-    await expect(findings).to_contain_text(said)
-
-
-def element(tab: Tab, name: str, canvas: str = "Drawing of the task") -> Locator:
-    """A place or transition of a drawing by its accessible name."""
-    return tab.get_by_role("application", name=canvas).get_by_role("button", name=re.compile(name))
-
-
-async def click_canvas(tab: Tab, x: float, y: float) -> None:
-    """Click so far into the drawing, as parts of its width and height."""
-    box = await tab.get_by_role("application", name="Drawing of the task").bounding_box()
-    assert box is not None
-    await tab.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
-
-
-async def draw_place(tab: Tab, kind: str, name: str, x: float, y: float) -> None:
-    """Put a place on the drawing and give it its name."""
-    await tab.get_by_role("toolbar", name="Drawing tools").get_by_role("button", name=kind).click()
-    await click_canvas(tab, x, y)
-    await rename(tab, name)
-    await expect(element(tab, f"^{kind} {name}")).to_be_visible()
-
-
-async def rename(tab: Tab, name: str) -> None:
-    """Give the selected element a name."""
-    field = tab.get_by_role("complementary", name="Properties").get_by_label("Name", exact=True)
-    await field.fill(name)
-    await field.press("Enter")
-
-
-async def draw_transition(tab: Tab, name: str, x: float, y: float) -> None:
-    """Put a transition on the drawing and give it its name."""
-    await tab.get_by_role("toolbar", name="Drawing tools").get_by_role("button", name="Transition").click()
-    await click_canvas(tab, x, y)
-    await rename(tab, name)
-    await expect(element(tab, f"^Transition {name}")).to_be_visible()
-
-
-async def draw_arcs(tab: Tab, *chains: str) -> None:
-    """Draw arcs along chains such as `a > t > b`, choosing one element after the other."""
-    await tab.get_by_role("toolbar", name="Drawing tools").get_by_role("button", name="Arc", exact=True).click()
-    for chain in chains:
-        names = [name.strip() for name in chain.split(">")]
-        for start, end in pairwise(names):
-            for name in (start, end):
-                await element(tab, f"^(Action place|Resource place|Control place|Transition) {name}\\b").click()
-    await tab.keyboard.press("Escape")
-
-
-async def choose_task(tab: Tab, place: str, primitive: str) -> None:
-    """Associate a primitive task that some node offers with an action place."""
-    await element(tab, f"^Action place {place}").click()
-    properties = tab.get_by_role("complementary", name="Properties")
-    await properties.get_by_label("Primitive task").select_option(primitive)
 
 
 async def test_a_new_user_draws_runs_and_understands(
@@ -162,48 +93,6 @@ async def test_a_new_user_draws_runs_and_understands(
     assert complaints == []
 
 
-async def hold_controls(tab: Tab) -> None:
-    """Take the controls, and wait until one holds them."""
-    await tab.get_by_role("button", name="Take controls").click()
-    await expect(tab.get_by_role("toolbar", name="Mission")).to_contain_text("You hold the controls")
-
-
-async def take_controls(tab: Tab) -> None:
-    """Take the controls on the live view and come back."""
-    await tab.get_by_role("tab", name="Live").click()
-    await hold_controls(tab)
-    await tab.get_by_role("tab", name="Design").click()
-    await settled(tab)
-
-
-async def draw_the_task(tab: Tab) -> None:
-    """`looking` for parts, then `picking` and `putting` them; a slip is cleared away."""
-    await draw_place(tab, "Control place", "jobs", 0.08, 0.3)
-    await draw_transition(tab, "begin", 0.2, 0.3)
-    for i, name in enumerate(("looking", "picking", "putting")):
-        await draw_place(tab, "Action place", name, 0.32 + 0.26 * i, 0.3)
-        await draw_transition(tab, f"{name}_done", 0.45 + 0.26 * i if i < 2 else 0.84, 0.3 if i < 2 else 0.6)
-    await draw_place(tab, "Resource place", "arm_free", 0.08, 0.6)
-    for place, primitive in (("looking", "look"), ("picking", "pick"), ("putting", "put")):
-        await choose_task(tab, place, primitive)
-    await draw_arcs(
-        tab,
-        "jobs > begin > looking > looking_done > picking > picking_done > putting > putting_done > arm_free > begin",
-    )
-    for place in ("looking", "picking", "putting"):
-        await element(tab, f"^Action place {place}").click()
-        await tab.get_by_role("button", name="Add error branch").click()
-    await draw_arcs(tab, *(f"{place}_error > arm_free" for place in ("looking", "picking", "putting")))
-    await element(tab, "^Control place jobs").click()
-    properties = tab.get_by_role("complementary", name="Properties")
-    await properties.get_by_label("Tokens at the start").fill("2")
-    await properties.get_by_label("Tokens at the start").press("Enter")
-    await click_canvas(tab, 0.5, 0.93)
-    await properties.get_by_label("Ends when").fill("jobs == 0 and arm_free == 1")
-    await properties.get_by_label("Ends when").press("Enter")
-    await properties.get_by_label("Remaining runs in").select_option("jobs")
-
-
 async def run_it_by_hand(tab: Tab, stage: Stage, shots: Path) -> None:
     """Pause, step, put a token in, go on, and read the reason of the provoked error."""
     mission = tab.get_by_role("status", name="Mission state")
@@ -228,16 +117,6 @@ async def run_it_by_hand(tab: Tab, stage: Stage, shots: Path) -> None:
     await why.get_by_role("button").click()
     await expect(tab.get_by_role("region", name="Selected")).to_contain_text("the part slipped out of the gripper")
     await tab.screenshot(path=shots / "why.png")
-
-
-# ---- live, with several operators -------------------------------------------------------------------------------------
-
-
-async def start_mission(tab: Tab, task: str = "") -> None:
-    """Take the controls and start."""
-    await hold_controls(tab)
-    await tab.get_by_role("toolbar", name="Mission").get_by_role("button", name="Start").click()
-    await expect(tab.get_by_role("status", name="Mission state")).to_contain_text("Running")
 
 
 async def test_two_operators(browser: Browser, page: Page, stage: Stage) -> None:
@@ -497,135 +376,6 @@ async def test_history(browser: Browser, page: Page, stage: Stage, shots: Path, 
     assert complaints == []
 
 
-# ---- drawing without a mouse, conflicts, formats ----------------------------------------------------------------------
-
-
-async def designer(browser: Browser, page: Page) -> Tab:
-    """The designer with the shipped task open."""
-    tab = await opened(browser, page)
-    await tab.get_by_role("tab", name="Design").click()
-    await settled(tab)
-    await checked(tab)
-    return tab
-
-
-async def test_drawing_by_keyboard_alone(browser: Browser, page: Page, faults: Watch) -> None:
-    """Places, transitions and arcs, names, undo and redo, copy, move and delete: no mouse, and Escape destroys nothing."""
-    tab = await designer(browser, page)
-    complaints = faults(tab)
-    await tab.get_by_role("button", name="New task").press("Enter")
-    for kind, name in (("Control place", "jobs"), ("Transition", "begin"), ("Action place", "work")):
-        await tab.get_by_role("toolbar", name="Drawing tools").get_by_role("button", name=kind).press("Enter")
-        await tab.keyboard.press("Enter")
-        await tab.keyboard.press("Control+a")
-        await tab.keyboard.type(name)
-        await tab.keyboard.press("Enter")
-        await expect(element(tab, f"^{kind} {name}")).to_be_visible()
-    drawing = tab.get_by_role("application", name="Drawing of the task")
-    for start, target in (("jobs", "begin"), ("begin", "work")):
-        await select_by_keyboard(tab, start)
-        await tab.keyboard.press("a")
-        await select_by_keyboard(tab, target)
-        await tab.keyboard.press("Enter")
-        await expect(drawing.get_by_role("button", name=f"Arc from {start} to {target}")).to_have_count(1)
-    await select_by_keyboard(tab, "work")
-    work = element(tab, "^Action place work")
-    before = await work.get_attribute("transform")
-    assert before
-    await tab.keyboard.press("ArrowRight")
-    await expect(work).not_to_have_attribute("transform", before)
-    await tab.keyboard.press("Control+z")
-    await expect(work).to_have_attribute("transform", before)
-    await tab.keyboard.press("Control+a")
-    await tab.keyboard.press("Control+c")
-    await tab.keyboard.press("Control+v")
-    await expect(element(tab, "^Action place work_2")).to_be_visible()
-    await expect(drawing.get_by_role("button", name="Arc from begin_2 to work_2")).to_have_count(1)
-    await tab.keyboard.press("Delete")
-    await expect(element(tab, "^Action place work_2")).to_be_hidden()
-    await tab.keyboard.press("Control+z")
-    await expect(element(tab, "^Action place work_2")).to_be_visible()
-    await tab.keyboard.press("Escape")
-    await expect(element(tab, "^Action place work_2")).to_be_visible()
-    await tab.keyboard.press("?")
-    await expect(tab.get_by_role("dialog", name="Keyboard")).to_be_visible()
-    assert complaints == []
-
-
-async def select_by_keyboard(tab: Tab, name: str) -> None:
-    """Go through the elements until the one of this name is selected."""
-    properties = tab.get_by_role("complementary", name="Properties")
-    for _ in range(12):
-        await tab.keyboard.press("]")
-        field = properties.get_by_label("Name", exact=True)
-        if await field.count() and await field.input_value() == name:
-            return
-    raise AssertionError(f"{name} was not reached")
-
-
-async def late(tab: Tab, pattern: str, method: str) -> asyncio.Event:
-    """From now on the server's answers to such requests come only once the event is set."""
-    arrive = asyncio.Event()
-
-    async def handle(route: Route) -> None:
-        if route.request.method != method:
-            await route.continue_()
-            return
-        response = await route.fetch()
-        await arrive.wait()
-        await route.fulfill(response=response)
-
-    await tab.route(pattern, handle)
-    return arrive
-
-
-async def test_a_late_answer_takes_nothing_away(browser: Browser, page: Page, tasks: Path) -> None:
-    """A task that comes in late does not replace what was begun meanwhile; a late save keeps what was drawn meanwhile."""
-    tab = await opened(browser, page)
-    opening = await late(tab, "**/api/tasks/*", "GET")
-    async with tab.expect_request("**/api/tasks/*"):
-        await tab.get_by_role("tab", name="Design").click()
-    await tab.get_by_role("button", name="New task").click()
-    await draw_place(tab, "Control place", "jobs", 0.3, 0.3)
-    opening.set()
-    await settled(tab)
-    await draw_place(tab, "Resource place", "arm_free", 0.5, 0.6)
-    drawing = tab.get_by_role("application", name="Drawing of the task")
-    await expect(drawing.get_by_role("button", name=re.compile(" place "))).to_have_count(2)
-
-    saving = await late(tab, "**/api/tasks/*", "PUT")
-    await tab.get_by_role("button", name="Save").click()
-    dialog = tab.get_by_role("dialog", name="Save the task as")
-    await dialog.get_by_label("Name").fill("late")
-    async with tab.expect_request("**/api/tasks/late"):
-        await dialog.get_by_role("button", name="OK").click()
-    await draw_place(tab, "Control place", "more", 0.7, 0.3)
-    saving.set()
-    await toasted(tab, "^Saved$")
-    await expect(tab.get_by_label("Task", exact=True)).to_have_value("late")
-    await expect(tab.get_by_role("status").filter(has_text=re.compile("^not saved$"))).to_be_visible()
-    await expect(element(tab, "^Control place more")).to_be_visible()
-    assert set(load(tasks / "late.toml").places) == {"jobs", "arm_free"}
-
-
-async def test_what_is_typed_while_the_page_loads_stays(browser: Browser, page: Page) -> None:
-    """Offers that come in late do not draw the form anew under the hands of whoever types already."""
-    tab = await opened(browser, page)
-    offers = await late(tab, "**/api/offers", "GET")
-    await tab.get_by_role("tab", name="Design").click()
-    await tab.get_by_role("button", name="New task").click()
-    goal = tab.get_by_label("Goal", exact=True)
-    await goal.fill("typed")
-    async with tab.expect_response("**/api/tasks"):
-        offers.set()
-    await settled(tab)
-    await expect(goal).to_be_focused()
-    await tab.keyboard.type(" early")
-    await tab.keyboard.press("Enter")
-    await expect(goal).to_have_value("typed early")
-    await expect(tab.locator(".saved")).to_have_text("not saved")
-
-
 async def test_a_press_is_not_lost_to_what_comes_in_meanwhile(browser: Browser, page: Page, stage: Stage) -> None:
     """Between press and release offers, findings and tokens come in: the form under the pointer waits, and the press counts."""
     tab = await designer(browser, page)
@@ -648,117 +398,6 @@ async def test_a_press_is_not_lost_to_what_comes_in_meanwhile(browser: Browser, 
     await until(lambda: "parts" in stage.state.breakpoints)
     await expect(selected.get_by_role("button", name="Remove breakpoint")).to_be_visible()
     await expect(selected).to_contain_text("1 of")
-
-
-@asynccontextmanager
-async def pressed(tab: Tab, button: str) -> AsyncIterator[None]:
-    """Hold a button down with the mouse for so long."""
-    await tab.get_by_role("button", name=button).hover()
-    await tab.mouse.down()
-    yield
-    await tab.mouse.up()
-
-
-async def test_what_may_not_be_drawn_says_why(browser: Browser, page: Page) -> None:
-    """An arc between two places is refused; a missing branch and an action that no node offers are shown where they are."""
-    tab = await designer(browser, page)
-    await tab.get_by_role("toolbar", name="Drawing tools").get_by_role("button", name="Arc", exact=True).click()
-    await element(tab, "^Action place look").click()
-    await element(tab, "^Action place pick").click()
-    await toasted(tab, "never two places")
-    await tab.keyboard.press("Escape")
-    await element(tab, "^Transition pick_failed").click()
-    await tab.keyboard.press("Delete")
-    findings = tab.get_by_role("region", name="Findings")
-    await expect(findings).to_contain_text("fault")
-    await findings.get_by_role("button", name=re.compile("^pick")).first.click()
-    properties = tab.get_by_role("complementary", name="Properties")
-    await expect(properties.get_by_label("Name", exact=True)).to_have_value("pick")
-    await tab.get_by_role("button", name="Undo").click()
-    await expect(findings).to_contain_text("May run")
-    await tab.get_by_role("searchbox", name="Find a place or transition").fill("clear")
-    await tab.keyboard.press("Enter")
-    await expect(properties.get_by_label("Name", exact=True)).to_have_value(re.compile("clear"))
-
-
-async def test_two_people_edit_one_task(browser: Browser, page: Page, tasks: Path) -> None:
-    """The later save is refused, both versions are shown, and nothing is lost whatever one chooses."""
-    ana, ben = await designer(browser, page), await designer(browser, page)
-    for tab, goal in ((ana, "from ana"), (ben, "from ben")):
-        field = tab.get_by_label("Goal", exact=True)
-        await field.fill(goal)
-        await field.press("Enter")
-        await tab.get_by_role("button", name="Save").click()
-        if goal == "from ana":
-            await expect(tab.get_by_role("status").filter(has_text=re.compile("^saved$"))).to_be_visible()
-    conflict = ben.get_by_role("dialog", name="Conflict")
-    await expect(conflict).to_contain_text('goal = "from ana"')
-    await expect(conflict).to_contain_text('goal = "from ben"')
-    assert load(tasks / "pick_and_place.toml").goal == "from ana"
-    await conflict.get_by_role("button", name="Replace theirs by mine").click()
-    await expect(conflict).to_be_hidden()
-    await expect(ben.get_by_role("status").filter(has_text=re.compile("^saved$"))).to_be_visible()
-    assert load(tasks / "pick_and_place.toml").goal == "from ben"
-
-
-async def test_formats_and_layout(browser: Browser, page: Page, tasks: Path, tmp_path: Path) -> None:
-    """SVG stands on its own, PNG and PNML come out, PNML comes back, and the layout button moves things as one step."""
-    tab = await designer(browser, page)
-    made = {}
-    for form in ("SVG", "PNG", "PNML", "TOML"):
-        async with tab.expect_download() as waiting:
-            await tab.get_by_label("Import and export").select_option(f"Export {form}")
-        download = await waiting.value
-        made[form] = tmp_path / download.suggested_filename
-        await download.save_as(made[form])
-    svg = made["SVG"].read_text()
-    assert svg.startswith("<svg") and "pick" in svg and "class=" not in svg and "var(--" not in svg
-    assert made["PNG"].read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" and made["PNG"].stat().st_size > 20_000
-    assert made["TOML"].read_text() == (tasks / "pick_and_place.toml").read_text()
-    await tab.get_by_label("File to import").set_input_files(made["PNML"])
-    await expect(element(tab, "^Control place pick,")).to_be_visible()
-    where = "() => [...document.querySelectorAll('.designer .net .element')].map((e) => e.getAttribute('transform'))"
-    before = await tab.evaluate(where)
-    await tab.get_by_role("button", name="Layout").click()
-    assert await tab.evaluate(where) != before
-    await tab.get_by_role("button", name="Undo").click()
-    assert await tab.evaluate(where) == before
-
-
-async def test_macro_places_open_in_both_views(browser: Browser, page: Page, stage: Stage, tasks: Path) -> None:
-    """A sub-net is drawn as one place, shows how many tokens are inside, and opens on demand."""
-    text = (tasks / "pick_and_place.toml").read_text()
-    inner = (
-        '\n[subnets.fetching]\nentry = "inside"\nnormal = "handed"\n'
-        '[subnets.fetching.places.inside]\nkind = "control"\nx = 80\ny = 100\n'
-        '[subnets.fetching.places.handed]\nkind = "control"\nx = 300\ny = 100\n'
-        '[subnets.fetching.transitions.pass_on]\nin = ["inside"]\nout = ["handed"]\nafter = 3600.0\nx = 190\ny = 100\n'
-        '\n[places.fetch]\nkind = "macro"\nsubnet = "fetching"\nx = 120\ny = 440\n'
-        '[transitions.leave]\nin = ["fetch:normal"]\nout = ["arm_free"]\nx = 200\ny = 380\n'
-    )
-    (tasks / "nested.toml").write_text(text.replace('out = ["look"]', 'out = ["fetch"]') + inner)
-    stage.load(load(tasks / "nested.toml"), (tasks / "nested.toml").read_text())
-    tab = await opened(browser, page)
-    await hold_controls(tab)
-    holder = stage.controls.holder
-    assert holder is not None
-    assert (await stage.command(holder, "start", {"task": "nested"}))["ok"]
-    stage.happen("part_there")
-    await expect(element(tab, "^Macro place fetch, 1 token", "Task net")).to_be_visible()
-    await element(tab, "^Macro place fetch", "Task net").click()
-    await tab.get_by_role("region", name="Selected").get_by_role("button", name="Open").click()
-    await expect(element(tab, "^Control place inside, 1 token", "Task net")).to_be_visible()
-    await tab.get_by_role("navigation", name="Opened macro places").get_by_role("button", name="pick and place").click()
-    await expect(element(tab, "^Macro place fetch", "Task net")).to_be_visible()
-    await tab.get_by_role("tab", name="Design").click()
-    await tab.get_by_label("Task", exact=True).select_option("nested")
-    await settled(tab)
-    await element(tab, "^Macro place fetch").click()
-    await tab.get_by_role("complementary", name="Properties").get_by_role("button", name="Open").click()
-    await expect(element(tab, "^Control place inside")).to_be_visible()
-
-
-# ---- the page's rules are the server's --------------------------------------------------------------------------------
 
 
 async def test_the_browser_applies_changes_as_the_server_does(browser: Browser, page: Page) -> None:
@@ -819,24 +458,3 @@ async def test_the_stop_is_within_reach_of_every_dialog(browser: Browser, page: 
     await expect(dialog).to_be_hidden()
     await until(lambda: len(stage.commands) > 1)
     assert [verb for _, verb, _ in stage.commands] == ["estop", "estop"]
-
-
-async def test_verdicts_stand_beside_the_drawing(browser: Browser, page: Page, shots: Path, faults: Watch) -> None:
-    """A task that may stop short of its end is told by itself; a press shows the marking and the firings that lead there."""
-    tab = await designer(browser, page)
-    complaints = faults(tab)
-    analysis = tab.get_by_role("region", name="Analysis")
-    await expect(analysis.get_by_role("status")).to_contain_text("nothing against it")
-    field = tab.get_by_label("Ends when")
-    await field.fill("parts == 0 and look == 1")
-    await field.press("Enter")
-    await expect(analysis.get_by_role("status")).to_contain_text("6 against it")
-    refused = analysis.get_by_role("button", name=re.compile("^Never stuck before its end: does not hold"))
-    await expect(element(tab, "^Control place parts, 2 tokens")).to_be_visible()
-    await refused.click()
-    await expect(element(tab, "^Control place parts(, no tokens|, 0 tokens)?$")).to_be_visible()
-    await expect(tab.locator(".net .turns").first).to_be_visible()
-    await tab.screenshot(path=shots / "verdicts.png")
-    await refused.click()
-    await expect(element(tab, "^Control place parts, 2 tokens")).to_be_visible()
-    assert complaints == []

@@ -21,7 +21,7 @@ if browser_missing() and os.environ.get("CI") != "true":
 from playwright.async_api import Browser, expect
 from playwright.async_api import Page as Tab
 
-from tests.hmi.test_browser import Watch
+from tests.hmi.steps import Watch
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 LONG = ("a_name_that_somebody_wrote_down_without_any_thought_of_screens_or_of_readers_" * 2)[:80]

@@ -23,7 +23,7 @@ if browser_missing() and os.environ.get("CI") != "true":
 from playwright.async_api import Browser, expect
 from playwright.async_api import Page as Tab
 
-from tests.hmi.test_browser import SIZE, Watch, checked, draw_the_task, element, hold_controls, settled
+from tests.hmi.steps import SIZE, Watch, checked, draw_the_task, element, hold_controls, settled
 from tests.ports import free_ports
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")

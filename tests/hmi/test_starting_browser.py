@@ -24,7 +24,7 @@ if browser_missing() and os.environ.get("CI") != "true":
 from playwright.async_api import Browser, Locator, expect
 from playwright.async_api import Page as Tab
 
-from tests.hmi.test_browser import Watch, element, hold_controls, opened
+from tests.hmi.steps import Watch, element, hold_controls, opened
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 expect.set_options(timeout=PATIENCE_MS)
