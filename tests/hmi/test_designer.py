@@ -28,6 +28,8 @@ if browser_missing() and os.environ.get("CI") != "true":
 from playwright.async_api import Browser, Locator, Route, WebSocketRoute, expect
 from playwright.async_api import Page as Tab
 
+from tests.hmi.steps import element, settled
+
 pytestmark = [pytest.mark.asyncio(loop_scope="module"), pytest.mark.usefixtures("_windows_are_closed")]
 DRAWING = "Drawing of the task"
 SHIPPED = Path(__file__).parents[2] / "coordinator" / "tasks" / "catch_ball.toml"
@@ -65,11 +67,6 @@ async def designing(browser: Browser, page: Page, task: str = "pick_and_place") 
     return tab, complaints
 
 
-async def settled(tab: Tab) -> None:
-    """The designer has opened what it was asked to open: nothing moves there any more by itself."""
-    await expect(tab.locator(".designer")).not_to_have_attribute("aria-busy", "true")
-
-
 async def open_task(tab: Tab, task: str) -> None:
     """Choose a task, and wait until it lies on the desk."""
     async with tab.expect_response(f"**/api/tasks/{task}"):
@@ -77,11 +74,6 @@ async def open_task(tab: Tab, task: str) -> None:
     await settled(tab)
     await expect(tab.get_by_label("Task", exact=True)).to_have_value(task)
     await expect(tab.locator(".saved")).to_have_text("saved")
-
-
-def element(tab: Tab, name: str, canvas: str = DRAWING) -> Locator:
-    """A place, transition or arc of a drawing by its accessible name."""
-    return tab.get_by_role("application", name=canvas).get_by_role("button", name=re.compile(name))
 
 
 def properties(tab: Tab) -> Locator:

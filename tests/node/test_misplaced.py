@@ -86,7 +86,7 @@ MISTAKES: list[tuple[str, str, str]] = [
     (
         "deadline = 12.0",
         "args = { margn = 5 }",
-        ":125: actions.follow_and_wait.args: follow_and_wait has no argument 'margn'; did you mean 'margin'?",
+        ":131: actions.follow_and_wait.args: follow_and_wait has no argument 'margn'; did you mean 'margin'?",
     ),
     ("deadline = 10.0", "args = 5", ":69: actions.locate_background.args: is 5; write a table of arguments"),
     ('to = "arm"', 'to = "army"', ":49: streams.catch_point.to: no device is named 'army'; did you mean 'arm'?"),
@@ -96,7 +96,7 @@ MISTAKES: list[tuple[str, str, str]] = [
     (
         'cell = "services/cell.toml"',
         'cell = "our_cell.toml"',
-        ":160: parameters.cell: {folder}/our_cell.toml is not there; write the path",
+        ":166: parameters.cell: {folder}/our_cell.toml is not there; write the path",
     ),
     ("[nodes.vision]", "[node.vision]", ":18: node: unknown table; did you mean 'nodes'?"),
     ("[nodes.vision]", "[nodes.vision", ":18: not valid TOML"),
