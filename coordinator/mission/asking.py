@@ -42,14 +42,18 @@ async def _ask(directory: Directory, node: str, timeout: float) -> dict[str, Any
     client = Client(entry.host, entry.port, caller, on_notices=hear, key=proves.key, tls=proves.client())
     client.start()
     answer: dict[str, Any] = {"address": f"{entry.host}:{entry.port}", "up": await client.connected(timeout)}
-    if answer["up"]:
-        caller.command(client.now(), Command(f"{name}/status", "status"))
-        client.flush()
-        status = await asyncio.wait_for(told, timeout)
-        if (ends := client.certificate_ends) is not None:
-            answer["certificate_ends"] = datetime.fromtimestamp(ends, UTC).isoformat()
-        answer |= {"offers": list(caller.offers), "boot": caller.boot, "version": NEWEST_VERSION, "status": status}
-    else:
-        answer["why"] = refused[-1] if refused else client.trouble
-    await client.close()
+    try:
+        if answer["up"]:
+            caller.command(client.now(), Command(f"{name}/status", "status"))
+            client.flush()
+            status = await asyncio.wait_for(told, timeout)
+            if (ends := client.certificate_ends) is not None:
+                answer["certificate_ends"] = datetime.fromtimestamp(ends, UTC).isoformat()
+            answer |= {"offers": list(caller.offers), "boot": caller.boot, "version": NEWEST_VERSION, "status": status}
+        else:
+            answer["why"] = refused[-1] if refused else client.trouble
+    except TimeoutError:
+        answer |= {"up": False, "why": f"it welcomed us, but did not say how it is within {timeout:g} s"}
+    finally:
+        await client.close()
     return answer

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -329,8 +328,7 @@ class Station:
 
     async def look(self) -> None:
         """Ask every node whether it is up and what it offers."""
-        with suppress(TimeoutError):
-            self._nodes = await ask_all(self.directory, PATIENCE)
+        self._nodes = await ask_all(self.directory, PATIENCE)
         if self._run is not None:
             return  # the run tells itself
         for name, answer in self._nodes.items():

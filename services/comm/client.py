@@ -11,7 +11,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
+import os
 import random
+import socket
 import ssl
 from collections.abc import Callable, Mapping
 from typing import Any, cast
@@ -299,4 +301,6 @@ class Client:
                 return f"{text}; make it anew with `petrobot keys --tls` and copy it to {peer}"
             return f"its certificate is not that of {self.caller.peer}: {fault.verify_message}"
         said = str(getattr(fault, "strerror", "") or fault) or "no answer"
+        if isinstance(fault, OSError) and fault.errno and not isinstance(fault, ssl.SSLError | socket.gaierror):
+            said = os.strerror(fault.errno).lower()  # asyncio's own words are the address once more
         return f"{said}; {NOT_TRUSTED}" if self.tls is not None and isinstance(fault, ConnectionError) else said

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 
@@ -73,9 +74,14 @@ async def test_what_cannot_be_started_says_why(cell: Cell) -> None:
 async def test_a_node_that_is_away_is_named_and_leaves_no_run(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
     """The start is refused with the node's name and address; the page says that it is lost, and a later start succeeds."""
     await cell.nodes["arm"].close()
-    await cell.station.look()
+
+    def offered() -> dict[str, bool]:
+        return {offer["node"]: offer["up"] for offer in cell.station.offers()}
+
+    async with asyncio.timeout(60.0):
+        while offered() != {"vision": True, "arm": False}:
+            await cell.station.look()
     assert cell.state["nodes"]["arm"]["state"] == "lost"
-    assert {offer["node"]: offer["up"] for offer in cell.station.offers()} == {"vision": True, "arm": False}
     answer = await cell.say("start", task="moving")
     assert answer["code"] == "unreachable" and answer["nodes"] == ["arm"] and "arm at 127.0.0.1:" in answer["text"]
     assert list(cell.runs.iterdir()) == []

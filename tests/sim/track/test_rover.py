@@ -92,7 +92,8 @@ def test_a_wheel_follows_with_its_lag(target: float, time: float) -> None:
 @given(st.lists(st.floats(0.001, 0.09), min_size=1, max_size=30))
 @settings(max_examples=40, deadline=None)
 def test_looking_often_changes_next_to_nothing(pauses: list[float]) -> None:
-    """Where the rover is depends on when it is looked at by rounding of the arcs alone."""
+    """Where the rover is depends on when it is looked at by rounding of the arcs alone, and by when it is first seen that a
+    wheel is nearer to its set point than what counts as there (1e-6 rad/s, so less than that times its lag)."""
     often, once = (rover(slip=0.02, slip_aside=0.01, slip_turn=0.02, seed=3) for _ in range(2))
     for body in (often, once):
         command(body, 3.0, 6.0)
@@ -101,7 +102,7 @@ def test_looking_often_changes_next_to_nothing(pauses: list[float]) -> None:
         now += pause
         often.move_to(now)
     once.move_to(now)
-    assert often.wheels[1].angle == pytest.approx(once.wheels[1].angle, abs=1e-9)
+    assert often.wheels[1].angle == pytest.approx(once.wheels[1].angle, abs=1e-7)
     assert (often.x, often.y, often.heading) == pytest.approx((once.x, once.y, once.heading), abs=2e-4)
 
 
