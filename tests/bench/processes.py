@@ -22,6 +22,14 @@ def pin(core: int) -> bool:
     return True
 
 
+def share() -> bool:
+    """Put this process, and all that it starts from now on, on one core, as ordinary processes. False where that cannot be."""
+    if not hasattr(os, "sched_setaffinity"):
+        return False
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    return True
+
+
 def unpin() -> None:
     """Back among ordinary processes, on all cores, as anybody's process is run."""
     if hasattr(os, "sched_setscheduler"):
@@ -30,9 +38,9 @@ def unpin() -> None:
 
 
 def start(script: str, *arguments: str, pinned: bool) -> subprocess.Popen[str]:
-    """A script of the benchmark again, in another part; its output is a pipe."""
+    """A script of the benchmark again, in another part; its input and its output are pipes."""
     command = [sys.executable, script, *arguments, "--pin" if pinned else "--no-pin"]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
 def quantile(values: Sequence[float], q: float) -> float:

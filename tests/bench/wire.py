@@ -3,15 +3,16 @@
     python tests/bench/wire.py                       # all that is installed
     python tests/bench/wire.py --quick --json out.json
 
-Contenders take turns every few calls, so that a busy machine is busy for all. Each server is a process of its own. All is
-measured twice: with both ends SCHED_FIFO on different cores (where that is permitted), which shows the code's own cost, and
-as anybody's processes are scheduled. Ratios are what counts: microseconds are this machine's.
+Contenders take turns every few calls, so that a busy machine is busy for all. Each end is a process of its own. All is
+measured three times: with both ends SCHED_FIFO on different cores (where that is permitted), as ordinary processes that share
+one core, and as the scheduler likes it. The first two show the code's own cost; in the third the scheduler may keep the ends of
+one contender on one core and put those of another on two, of which the other one has to be woken for each message. Ratios are
+what counts: microseconds are this machine's.
 """
 
 from __future__ import annotations
 
 import argparse
-import gc
 import importlib.util
 import json
 import os
@@ -23,7 +24,8 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from tests.bench.processes import load, pin, quantile, show, start, unpin
+from tests.bench.processes import load, pin, quantile, share, show, unpin
+from tests.bench.wire_asker import Asker, ask
 from tests.bench.wire_contenders import Bare, Contender, Petrobot, PetrobotSealed
 from tests.bench.wire_peers import CONTENDERS
 from tests.bench.wire_streams import measure_streams
@@ -40,7 +42,7 @@ TURN = 20
 NOISE = 1.15
 """Ratios nearer to 1 than this say nothing on a machine that does other things too."""
 PEERS = ("Pyro5", "RPyC", "pyzmq", "grpc.aio")
-PINNED, ORDINARY = "a core each end", "ordinary processes"
+PINNED, SHARED, ORDINARY = "a core each end", "one core for both ends", "as the scheduler likes it"
 """How the two ends are scheduled."""
 
 
@@ -49,43 +51,34 @@ class Table:
 
     def __init__(self, contenders: Sequence[type[Contender]], pinned: bool) -> None:
         self.rows: dict[str, dict[str, list[float]]] = {}
-        self._contenders = [one() for one in contenders]
-        self._processes = [start(__file__, "--serve", one.name, pinned=pinned) for one in self._contenders]
-        for one, process in zip(self._contenders, self._processes, strict=True):
-            assert process.stdout is not None
-            one.connect(int(process.stdout.readline()))
-            one.latencies(200, 0)
-        gc.collect()
-        gc.freeze()  # what all of them have imported is no garbage of the one that is being measured
+        self._askers = {one.name: Asker(__file__, one.name, pinned) for one in contenders}
 
     def measure(self, rounds: int, calls: int) -> None:
         """Rounds of all; within a round they take turns every few calls, so that the machine is in one mood for all."""
         for number in range(rounds):
             taken = self._take_turns(calls, 0.0)
             spaced = self._take_turns(calls // 4, GAP)
-            for one in self._contenders:
-                row = self.rows.setdefault(one.name, {name: [] for name in ROWS})
-                row["call"] += taken[one.name]
-                row["spaced"] += spaced[one.name]
-                row["round p50"].append(quantile(taken[one.name], 0.5))
-                row["spaced p50"].append(quantile(spaced[one.name], 0.5))
+            for name, one in self._askers.items():
+                row = self.rows.setdefault(name, {column: [] for column in ROWS})
+                row["call"] += taken[name]
+                row["spaced"] += spaced[name]
+                row["round p50"].append(quantile(taken[name], 0.5))
+                row["spaced p50"].append(quantile(spaced[name], 0.5))
                 row["big"] += one.latencies(max(calls // 20, 20), BIG)
                 row["rate"].append(one.rate(max(calls // IN_FLIGHT, LEAST) * IN_FLIGHT, IN_FLIGHT))
             print(f"round {number + 1} of {rounds} done", file=sys.stderr)
 
     def _take_turns(self, calls: int, gap: float) -> dict[str, list[float]]:
-        taken: dict[str, list[float]] = {one.name: [] for one in self._contenders}
+        taken: dict[str, list[float]] = {name: [] for name in self._askers}
         for _ in range(max(calls // TURN, 1)):
-            for one in self._contenders:
-                taken[one.name] += one.latencies(TURN, 0, gap)
+            for name, one in self._askers.items():
+                taken[name] += one.latencies(TURN, 0, gap)
         return taken
 
     def close(self) -> None:
-        """End all servers."""
-        for one, process in zip(self._contenders, self._processes, strict=True):
+        """End all processes."""
+        for one in self._askers.values():
             one.close()
-            process.kill()
-            process.communicate()
 
     def results(self) -> dict[str, dict[str, float]]:
         """Microseconds and calls per second, and their ratios to the bare echo's (median, least and largest of the rounds)."""
@@ -144,8 +137,9 @@ def _below(found: list[float], limit: float) -> tuple[list[float], float, bool]:
     return found, limit, quantile(found, 0.5) <= limit
 
 
-def scheduled(pinned: bool, arguments: argparse.Namespace) -> dict[str, Any]:
+def scheduled(how: str, arguments: argparse.Namespace) -> dict[str, Any]:
     """All measurements with one way of scheduling."""
+    pinned = how == PINNED
     table = Table([one for one in CONTENDERS if _is_installed(one)], pinned)
     try:
         table.measure(arguments.rounds, arguments.calls)
@@ -154,7 +148,7 @@ def scheduled(pinned: bool, arguments: argparse.Namespace) -> dict[str, Any]:
     calls = table.results()
     streams = measure_streams(max(arguments.rounds // 3, 1), arguments.seconds, pinned)
     goals = call_goals(table) | stream_goals(streams)
-    print(f"\n== {PINNED if pinned else ORDINARY} ==")
+    print(f"\n== {how} ==")
     show("calls", calls)
     show("streams (age when taken)", streams)
     print(f"\n{'goal (median, least and largest of the rounds)':52}{'limit':>7}{'median':>8}{'least':>8}{'largest':>8}")
@@ -169,19 +163,33 @@ def _is_installed(one: type[Contender]) -> bool:
 
 
 def run(arguments: argparse.Namespace) -> dict[str, Any]:
-    """All measurements, in both ways of scheduling where the first is permitted."""
+    """All measurements, in every way of scheduling that is permitted."""
     missing = [one.name for one in CONTENDERS if not _is_installed(one)]
     where: dict[str, Any] = {"python": platform.python_version(), "cores": os.cpu_count(), "load_before": load()}
     where["missing"] = missing
     results: dict[str, Any] = {"where": where}
     if arguments.pin and pin(0):
-        results[PINNED] = scheduled(True, arguments)
+        results[PINNED] = scheduled(PINNED, arguments)
         unpin()
-    results[ORDINARY] = scheduled(False, arguments)
+    if share():
+        results[SHARED] = scheduled(SHARED, arguments)
+        unpin()
+    results[ORDINARY] = scheduled(ORDINARY, arguments)
     where["load_after"] = load()
     print(f"\nnot installed: {', '.join(missing) or 'none'}")
     print(f"load of this machine before: {where['load_before']}; after: {where['load_after']}")
     return results
+
+
+def _be_one_end(arguments: argparse.Namespace) -> None:
+    name, *port = [arguments.serve] if arguments.serve else arguments.ask
+    contender = next(one for one in CONTENDERS if one.name == name)()
+    if arguments.pin:
+        pin(0 if port else 1)
+    if port:
+        ask(contender, int(port[0]))
+    else:
+        contender.serve()
 
 
 def main() -> None:
@@ -196,11 +204,10 @@ def main() -> None:
         "--pin", action=argparse.BooleanOptionalAction, default=True, help="measure with SCHED_FIFO, too"
     )
     parser.add_argument("--serve", help=argparse.SUPPRESS)
+    parser.add_argument("--ask", nargs=2, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    if arguments.serve:
-        if arguments.pin:
-            pin(1)
-        next(one for one in CONTENDERS if one.name == arguments.serve)().serve()
+    if arguments.serve or arguments.ask:
+        _be_one_end(arguments)
         return
     if arguments.quick:
         arguments.rounds, arguments.calls, arguments.seconds = 3, 500, 1.0

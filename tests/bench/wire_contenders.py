@@ -1,4 +1,4 @@
-"""The contenders of `wire.py`: one echo service each, served by a process of its own, asked by the benchmark's process.
+"""The contenders of `wire.py`: one echo service each, served by a process of its own and asked by another one.
 
 All carry the same record there and back: a name, three numbers and a text, by value.
 """
