@@ -68,7 +68,8 @@ def killed_and_resumed(folder: Path, count: int, kills: list[int], first: list[s
     return result
 
 
-NEVER_BEGUN = {(Status.ERROR, Executed.NO), (Status.ERROR, Executed.UNKNOWN)}
+NEVER_BEGUN = {(Status.ERROR, Executed.NO), (Status.ERROR, Executed.UNKNOWN), (None, Executed.NO)}
+"""Status and whether it was executed, of runs that may have made no move; the last one is preempted before its first step."""
 
 
 def ends_of(folder: Path) -> dict[str, RunRecorded]:
