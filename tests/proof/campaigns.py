@@ -14,6 +14,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from coordinator.campaign.rows import Row
@@ -96,10 +97,21 @@ def speed(sizes: Sizes, options: argparse.Namespace) -> Result:
         "times real time a CPU second": found["times_real_time_per_cpu_s"],
         "largest memory of the first workers (MiB)": first,
         "of the later ones (MiB)": later,
+        "gained by a worker in its life (MiB)": memory_gained(sizes.folder / "speed" / "times.csv"),
         "killed": kills,
         "same table when killed": same,
         "holds": holds,
     }
+
+
+def memory_gained(times: Path) -> float:
+    """The largest gain of a worker from the median of its third to eighth block to that of its last six (MiB)."""
+    by_worker: dict[str, list[float]] = {}
+    with times.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            by_worker.setdefault(row["worker"], []).append(float(row["rss_mb"]))
+    gains = [median(rss[-6:]) - median(rss[2:8]) for rss in by_worker.values() if len(rss) >= 16]
+    return round(max(gains, default=0.0), 1)
 
 
 def largest_memory(times: Path) -> list[float]:
