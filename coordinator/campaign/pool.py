@@ -13,8 +13,8 @@ from typing import Any
 
 from coordinator.campaign.plan import CampaignError, Plan
 
-RETIRES_AFTER = 40
-"""Blocks after which a worker is replaced, so that what leaks in native libraries does not add up."""
+RETIRES_AFTER = 200
+"""Blocks after which a worker is replaced, so that what a user's action or a native library may leak does not add up."""
 TRIES = 3
 """Workers that a block may take with it before it counts as the block's fault."""
 LONGEST_LINE = 1 << 26

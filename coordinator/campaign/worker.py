@@ -10,7 +10,7 @@ import gc
 import json
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from typing import Any, TextIO
 
@@ -32,15 +32,16 @@ def answer(plan: str, order: Mapping[str, Any]) -> dict[str, Any]:
         return {"index": order["block"]["index"], "fault": str(fault)}
 
 
-def serve(orders: TextIO, answers: TextIO) -> None:
-    """Answer each order until there is none."""
-    plan, settled = orders.readline(), False
+def serve(orders: Iterator[str], answers: TextIO) -> None:
+    """Answer each order until there is none; the first line is the plan. Nothing of a block is there when the next one begins."""
+    plan, settled = next(orders, ""), False
     for line in orders:
         print(json.dumps(answer(plan, json.loads(line))), file=answers, flush=True)
+        # A mission refers to itself in circles: left to the collector's own time, several pile up and break the heap into pieces
+        gc.collect()
         if not settled:
-            # what the first block has loaded stays: the collector need not look through it in every later one
+            # what the first block has loaded stays: the collector need not look through it in every later one (2 ms, not 200)
             settled = True
-            gc.collect()
             gc.freeze()
 
 

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import gc
+import io
+import json
 import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,6 +17,7 @@ from coordinator.campaign.conduct import Campaign, Progress
 from coordinator.campaign.plan import CampaignError, Plan
 from coordinator.campaign.pool import LocalPool
 from coordinator.campaign.table import TABLE, read_table
+from coordinator.campaign.worker import serve
 from coordinator.launch import Setting, lockstep_cell
 from tests.campaign.conftest import Conduct
 from tests.waiting import beat
@@ -162,6 +167,28 @@ def test_workers_in_any_number_and_a_killed_one_change_nothing(
         assert pool.lost == kill
         assert table(tmp_path / f"by_{count}") == table(alone.folder)
     assert len(list(read_table(tmp_path / "by_3" / TABLE))) == 12
+
+
+def test_nothing_of_a_block_is_there_when_the_next_one_begins(toy_plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A worker's memory stays flat although a mission refers to itself in circles and the collector has its own time."""
+    left: list[int] = []
+
+    def orders() -> Iterator[str]:
+        yield json.dumps(toy_plan.to_plain())
+        for block in toy_plan.blocks:
+            yield json.dumps({"block": block.to_plain(), "weights": []})
+            left.append(gc.collect())
+
+    monkeypatch.setattr(gc, "freeze", lambda: None)  # for good in a worker; here it would be for all tests that follow
+    answers = io.StringIO()
+    gc.collect()
+    gc.disable()
+    try:
+        serve(orders(), answers)
+    finally:
+        gc.enable()
+    assert len(answers.getvalue().splitlines()) == len(toy_plan.blocks) == len(left)
+    assert not any(left)
 
 
 def test_learning_depends_on_batches_alone(conduct: Conduct) -> None:
