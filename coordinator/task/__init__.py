@@ -1,6 +1,6 @@
 """The robotic task model: records, the expansion of macro places, and what every task must satisfy to mean something."""
 
-from coordinator.task.model import (
+from coordinator.task.elements import (
     Counts,
     Early,
     End,
@@ -19,12 +19,12 @@ from coordinator.task.model import (
     Start,
     Status,
     Subnet,
-    Task,
     Transition,
     Value,
     Variable,
     VariableType,
 )
+from coordinator.task.model import Task
 
 __all__ = [
     "Counts",

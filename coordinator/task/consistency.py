@@ -14,8 +14,7 @@ from math import isfinite
 from coordinator.conditions import Expression
 from coordinator.conditions.regions import Domain, kind_faults
 from coordinator.conditions.wording import Fault, listed, nearest
-from coordinator.task.macros import macro_faults
-from coordinator.task.model import (
+from coordinator.task.elements import (
     Early,
     End,
     Event,
@@ -28,12 +27,13 @@ from coordinator.task.model import (
     Scope,
     Status,
     Subnet,
-    Task,
     Transition,
     Value,
     Variable,
     VariableType,
 )
+from coordinator.task.macros import macro_faults
+from coordinator.task.model import Task
 
 _IDENTIFIER = re.compile(r"[^\W\d]\w*\Z")
 _RESERVED = frozenset({"and", "or", "not", "true", "false", "none"})

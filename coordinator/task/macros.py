@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from coordinator.conditions.wording import Fault, listed, nearest
-from coordinator.task.model import Kind, Place, Transition
+from coordinator.task.elements import Kind, Place, Transition
 
 
 def macros_around(macro: str, places: Mapping[str, Place]) -> Iterator[str]:

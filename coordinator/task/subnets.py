@@ -1,4 +1,4 @@
-"""Macro places: a task with every macro place replaced by its subnet, names prefixed with the macro place's.
+"""Macro places: a net with every macro place replaced by its subnet, names prefixed with the macro place's.
 
 A macro place without a subnet only shows what is drawn within it (`macro`): that stays as it is, the place is dropped. In the
 flat task `macro` of every place and transition is the full name of the innermost macro place around it.
@@ -7,48 +7,55 @@ flat task `macro` of every place and transition is the full name of the innermos
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 from coordinator.conditions import rename
-from coordinator.task.model import End, Input, Kind, Output, Place, Subnet, Task, Transition
+from coordinator.task.elements import End, Input, Kind, Output, Place, Subnet, Transition
 
 
-def expand(task: Task) -> Task:
-    """The flat task. Raises ValueError on subnets that contain themselves; other faults are for `consistency.faults`."""
-    places: dict[str, Place] = {}
-    transitions: dict[str, Transition] = {}
-    entries: dict[str, Subnet] = {}
-    _unfold(task, "", task.places, task.transitions, (), places, transitions, entries)
-    rewired = {name: _rewire(t, entries) for name, t in transitions.items()}
-    return replace(task, places=places, transitions=rewired, subnets={})
+@dataclass(frozen=True, slots=True)
+class _Flat:
+    """What has been unfolded so far, by full name."""
+
+    subnets: Mapping[str, Subnet]
+    places: dict[str, Place] = field(default_factory=dict)
+    transitions: dict[str, Transition] = field(default_factory=dict)
+    entered: dict[str, Subnet] = field(default_factory=dict)
+    """The subnet of each macro place."""
+
+
+def unfolded(
+    places: Mapping[str, Place], transitions: Mapping[str, Transition], subnets: Mapping[str, Subnet]
+) -> tuple[dict[str, Place], dict[str, Transition]]:
+    """Places and transitions of the flat net.
+
+    Raises ValueError on subnets that contain themselves; other faults are for `consistency.faults`.
+    """
+    flat = _Flat(subnets)
+    _unfold(flat, "", places, transitions, ())
+    return flat.places, {name: _rewire(t, flat.entered) for name, t in flat.transitions.items()}
 
 
 def _unfold(
-    task: Task,
+    flat: _Flat,
     prefix: str,
-    new_places: Mapping[str, Place],
-    new_transitions: Mapping[str, Transition],
+    places: Mapping[str, Place],
+    transitions: Mapping[str, Transition],
     inside: tuple[str, ...],
-    places: dict[str, Place],
-    transitions: dict[str, Transition],
-    entries: dict[str, Subnet],
 ) -> None:
     """Add the places and transitions under a prefix, and those of the macro places among them."""
-    for place in new_places.values():
+    for place in places.values():
         name = prefix + place.name
         if place.kind is not Kind.MACRO:
-            places[name] = replace(place, name=name, macro=_around(prefix, place.macro))
+            flat.places[name] = replace(place, name=name, macro=_around(prefix, place.macro))
         if place.kind is not Kind.MACRO or not place.subnet:
             continue
         if place.subnet in inside:
             raise ValueError(f"subnet {place.subnet!r} contains itself by {' > '.join((*inside, place.subnet))}")
-        subnet = task.subnets[place.subnet]
-        entries[name] = subnet
-        _unfold(
-            task, f"{name}.", subnet.places, subnet.transitions, (*inside, place.subnet), places, transitions, entries
-        )
-    for transition in new_transitions.values():
-        transitions[prefix + transition.name] = _prefixed(transition, prefix, new_places) if prefix else transition
+        flat.entered[name] = subnet = flat.subnets[place.subnet]
+        _unfold(flat, f"{name}.", subnet.places, subnet.transitions, (*inside, place.subnet))
+    for transition in transitions.values():
+        flat.transitions[prefix + transition.name] = _prefixed(transition, prefix, places) if prefix else transition
 
 
 def _around(prefix: str, macro: str) -> str:
