@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import secrets
 import socket as sockets
 import ssl
@@ -21,6 +22,8 @@ from coordinator.hmi.sessions import Session
 from coordinator.hmi.store import TaskStore
 
 PAGE_FILES = Path(__file__).parent / "page"
+LAST_COMMANDS_S = 1.0
+"""Time that commands have at the end; the one that ended the run (`abort`) is among them."""
 
 
 class Page:
@@ -52,9 +55,12 @@ class Page:
             await asyncio.wait(set(self._house.commands))
 
     async def close(self) -> None:
-        """Close all connections and the port; commands that are being carried out are given up."""
+        """Close all connections and the port. Whoever gave the last commands is answered; one that takes long is given up."""
         self._listening.close()
         self._house.closing = True
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(LAST_COMMANDS_S):
+                await self.idle()
         await asyncio.gather(*(session.leave() for session in self._house.sessions))
         await self._runner.cleanup()
         for task in list(self._house.commands):

@@ -95,6 +95,9 @@ class Session:
             async with asyncio.timeout(1.0):
                 if self._pending and not self._pending.stale:
                     await self._send(self._encoded(self._pending.take()))  # how it ended
+                answers, self._answers = self._answers, []
+                for answer in answers:
+                    await self._send(encode(answer))
                 await self._socket.close(code=WSCloseCode.GOING_AWAY, message=b"the coordinator has ended")
 
     def _receive(self, change: dict[str, Any]) -> None:

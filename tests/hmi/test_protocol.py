@@ -15,6 +15,7 @@ from coordinator.hmi import house, sessions
 from coordinator.hmi.changes import apply
 from coordinator.hmi.server import Page
 from tests.hmi.stage import Stage
+from tests.waiting import beat
 
 
 class Client:
@@ -169,6 +170,26 @@ async def test_commands_go_on_when_their_client_leaves(page: Page, stage: Stage)
     go.set()
     await asyncio.wait_for(page.idle(), 60)
     assert len(done) == 1
+
+
+async def test_the_command_that_ends_the_run_is_answered(page: Page, stage: Stage) -> None:
+    """The coordinator closes while it is still being carried out: whoever gave it hears that it was."""
+    begun, closing = asyncio.Event(), asyncio.Event()
+
+    async def last(who: str, data: Any) -> dict[str, Any]:
+        begun.set()
+        await closing.wait()
+        return {"ok": True, "last": True}
+
+    stage.__dict__["_estop"] = last
+    async with joined(page) as client:
+        asked = asyncio.create_task(client.command("estop"))
+        await asyncio.wait_for(begun.wait(), 60)
+        ended = asyncio.create_task(page.close())
+        await beat(0)  # it has begun to close
+        closing.set()
+        assert (await asked)["last"]
+        await ended
 
 
 async def test_a_fault_in_the_mission_is_an_answer(page: Page, stage: Stage) -> None:
