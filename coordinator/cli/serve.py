@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
 from coordinator.cli.loading import SHIPPED, add_services_argument, load_directory
+from coordinator.cli.page_port import add_page_port_argument, named_port
 
 if TYPE_CHECKING:
     from coordinator.hmi.server import Page
@@ -37,9 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--up", action="store_true", help="launch the nodes of this host, and end them with this command"
     )
     parser.add_argument("--mock", metavar="FILE", type=Path, help="with --up: replace actions by scripted ones")
-    parser.add_argument(
-        "--page-port", type=int, default=0, metavar="PORT", help="the page's port (default: a free one)"
-    )
+    add_page_port_argument(parser)
     parser.add_argument(
         "--estimates",
         metavar="FOLDER",
@@ -87,7 +86,7 @@ async def _page(station: Station, runs: Path, options: argparse.Namespace, stop:
     from coordinator.hmi.journals import JournalHistory
     from coordinator.hmi.server import start_page
 
-    try:
+    with named_port(options.page_port):
         page = await start_page(
             station,
             tasks_folder=options.tasks,
@@ -97,8 +96,6 @@ async def _page(station: Station, runs: Path, options: argparse.Namespace, stop:
             history=JournalHistory(runs),
             starts=station.form,
         )
-    except OSError as fault:
-        raise CommandError(2, f"port {options.page_port}: {fault.strerror}; choose another with --page-port") from fault
     station.door = _doors(station.directory, page)
     try:
         print(f"page: {page.url}\nCtrl-C ends it", flush=True)

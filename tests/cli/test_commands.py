@@ -96,6 +96,23 @@ def test_a_node_ends_with_its_command(tmp_path: Path) -> None:
         assert again.connect_ex(("127.0.0.1", port)) != 0
 
 
+@pytest.mark.parametrize("command", [("run", "catch_ball", "--mode", "lockstep"), ("serve",), ("resume", "last")])
+@pytest.mark.parametrize("port", ["99999", "-1", "web"])
+def test_what_is_no_port_is_refused(command: tuple[str, ...], port: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """It is not taken for another number."""
+    assert main([*command, "--page-port", port]) == 2
+    said = capsys.readouterr().err
+    assert "--page-port" in said and "from 1 to 65535" in said
+
+
+def test_a_port_in_use_is_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One line with the remedy."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert main(["serve", "--page-port", str(port), "--tasks", str(tmp_path), "--journal", str(tmp_path)]) == 2
+    assert f"port {port}: Address already in use; choose another with --page-port" in capsys.readouterr().err
+
+
 def test_check_gives_its_findings_as_json(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """The shipped task may run on the shipped nodes."""
     monkeypatch.chdir(ROOT)
@@ -139,6 +156,8 @@ def test_a_task_that_can_deadlock_is_refused(tmp_path: Path, capsys: pytest.Capt
     assert "deadlock free NO" in capsys.readouterr().out
     assert main(["analyse", str(path)]) == 1
     assert "failed" in capsys.readouterr().out
+    assert main(["run", str(path), "--services", str(services), "--mode", "lockstep"]) == 1
+    assert "warning: stuck: deadlock free: " in capsys.readouterr().err
 
 
 def test_analyse_and_convert(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
