@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from coordinator.cli import CommandError
 from coordinator.cli.loading import task_path, write_json
 from coordinator.cli.quantities import number, whole
 
@@ -114,9 +115,13 @@ def progress_of_search(limits: Limits) -> Iterator[Limits]:
 
 
 def give(outcome: Outcome, json_file: str | None) -> int:
-    """Print and write what an analysis command found; gives its exit code."""
+    """Print and write what an analysis command found; gives its exit code. Raises CommandError for bad input."""
+    from coordinator.analysis.commands import BAD_INPUT
+
     if json_file:
         write_json(json_file, outcome.data)
+    if outcome.code == BAD_INPUT:
+        raise CommandError(BAD_INPUT, outcome.text)
     if json_file != "-":
         print(outcome.text)
     return outcome.code

@@ -156,6 +156,7 @@ def _print_check(check: dict[str, Any] | None) -> None:
 
 def _refuse_unfit(task: Task, options: argparse.Namespace) -> None:
     from coordinator.check import check
+    from coordinator.cli.lockstep import substitutes
 
     directory = load_directory(options.services)
     report = check(task, {action: entry.node for action, entry in directory.actions.items()})
@@ -163,6 +164,7 @@ def _refuse_unfit(task: Task, options: argparse.Namespace) -> None:
     if faults:
         lines = "\n".join(f"  {f.key}: {f.text}\n    {f.remedy}" for f in faults)
         raise CommandError(2, f"{task.name} may not run with {directory.source}:\n{lines}")
+    substitutes(options.mock, directory)  # refuses a script for actions that there are not
     if not options.cluster:
         refuse_misplaced(directory, everywhere=True, scripted=options.mock is not None)
 
