@@ -101,7 +101,8 @@ def load_directory(given: Path | None) -> Directory:
     try:
         return load(path)
     except OSError as fault:
-        raise CommandError(2, f"{path}: {fault.strerror or fault}") from fault
+        text = f"{path}: {fault.strerror or fault}; give --services a location file that can be read"
+        raise CommandError(2, text) from fault
     except DirectoryError as fault:
         raise CommandError(2, str(fault)) from fault
 

@@ -116,7 +116,7 @@ def substitutes(mock: Path | None, directory: Directory) -> Mapping[str, Callabl
     try:
         scripted: Mapping[str, Callable[..., Any]] = load_object(SCRIPTED)(mock)
     except OSError as fault:
-        raise CommandError(2, f"{mock}: {fault.strerror}") from fault
+        raise CommandError(2, f"{mock}: {fault.strerror}; give --mock a file of scripted actions") from fault
     except Exception as fault:
         raise CommandError(2, str(fault)) from fault
     for name in scripted:

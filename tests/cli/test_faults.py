@@ -85,6 +85,8 @@ def petrobot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
             "run work.toml --mode lockstep --mock mock.toml",
             "mock.toml:4: actions.recovre: services.toml has no such action",
         ),
+        ("check work.toml --services no.toml", "no.toml: No such file or directory; give --services a location file"),
+        ("campaign work.toml --mock no.toml", "no.toml: No such file or directory; give --mock a file of scripted"),
         ("campaign work.toml --mock mock.toml", "(did you mean 'recover'?); name one of its actions, or drop it here"),
         (
             "forecast --compare a b",
