@@ -14,6 +14,7 @@ from coordinator.cli.loading import (
     load_directory,
     load_task,
     refuse_misplaced,
+    task_path,
     write_json,
 )
 
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
     from coordinator.task import Task
 
 EXAMPLE = "petrobot check catch_ball"
+NO_CELL = "no-cell"
+"""Code of the finding about the location file that was not given."""
 PATIENCE = 2.0
 """Seconds that a node has to answer."""
 MOST_STATES, LONGEST, MOST_MEMORY = 200_000, 5.0, 500_000_000
@@ -53,13 +56,11 @@ def run(options: argparse.Namespace) -> int:
     live = {"live": missing} if options.live else {}
     if options.json:
         found = {} if analysis is None else _plain_analysis(analysis)
-        write_json(options.json, {"task": task.name, "ok": ok, "findings": _plain(report), **found, **live})
+        findings = _plain(report, options.task)
+        write_json(options.json, {"task": task.name, "ok": ok, "findings": findings, **found, **live})
     if options.json != "-":
-        print(
-            "\n".join(
-                [*(f"missing {line}" for line in missing), _text(options.task, report, analysis, ok and not missing)]
-            )
-        )
+        told = [f"missing {line}" for line in missing] + _told(report, options.task)
+        print("\n".join([*told, _text(options.task, analysis, ok and not missing)]))
     return 2 if not ok else 130 if analysis is not None and analysis.interrupted else 3 if missing else 0
 
 
@@ -88,7 +89,7 @@ def _noted(report: Report, said: str) -> Report:
     from coordinator.check import Finding, Report, Severity
 
     remedy = "write one of your own, or give --services FILE"
-    return Report((*report.findings, Finding(Severity.NOTE, "no-cell", "services.toml", said, remedy)))
+    return Report((*report.findings, Finding(Severity.NOTE, NO_CELL, "services.toml", said, remedy)))
 
 
 def _missing(task: Task, services: Path | None) -> list[str]:
@@ -128,16 +129,34 @@ def _plain_analysis(analysis: Analysis) -> dict[str, Any]:
     return {"complete": data["complete"], "objections": objections, "analysis": data}
 
 
-def _plain(report: Report) -> list[dict[str, str]]:
+def _plain(report: Report, name: str) -> list[dict[str, Any]]:
     fields = ("severity", "key", "text", "remedy")
-    return [{field: str(getattr(finding, field)) for field in fields} for finding in report.findings]
-
-
-def _text(name: str, report: Report, analysis: Analysis | None, ok: bool) -> str:
-    ended = ""
-    lines = [
-        f"{f.severity:8}{f.key}: {f.text}" + (f"\n        {f.remedy}" if f.remedy else "") for f in report.findings
+    return [
+        {**{field: str(getattr(finding, field)) for field in fields}, "line": line}
+        for finding, line in zip(report.findings, _lines(report, name), strict=True)
     ]
+
+
+def _told(report: Report, name: str) -> list[str]:
+    """The findings for people, each with the place in the task file that it is about."""
+    path = task_path(name)
+    places = [f"{path}:{line}: " if line else "" for line in _lines(report, name)]
+    return [
+        f"{f.severity:8}{place}{f.key}: {f.text}" + (f"\n        {f.remedy}" if f.remedy else "")
+        for f, place in zip(report.findings, places, strict=True)
+    ]
+
+
+def _lines(report: Report, name: str) -> list[int | None]:
+    """The line of each finding's key, or of the macro place in which it is; None for what is not about the task file."""
+    from coordinator.taskfile.errors import key_lines, line_of
+
+    lines = key_lines(task_path(name).read_text(encoding="utf-8"))
+    return [None if f.code == NO_CELL else line_of(f.key, lines) for f in report.findings]
+
+
+def _text(name: str, analysis: Analysis | None, ok: bool) -> str:
+    ended, lines = "", list[str]()
     if analysis is not None:
         verdicts = {True: "yes", False: "NO", None: "unknown"}
         shown = {k: v for k, v in analysis.verdicts().items() if k != "safe"}  # runs to do are several tokens

@@ -124,7 +124,8 @@ def test_an_action_that_translates_another_task_is_told(petrobot: Petrobot) -> N
     code, out, _ = petrobot("check", "work.toml")
     assert code == 0
     assert (
-        "warning primitive_tasks.work.alternatives: services.toml says that the action 'work' translates 'wrok'" in out
+        "warning work.toml:13: primitive_tasks.work.alternatives: services.toml says that the action 'work' translates 'wrok'"
+        in out
     )
     assert "write task = 'work' in its [actions.work]" in out
 
