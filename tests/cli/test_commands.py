@@ -195,6 +195,45 @@ def test_lockstep_run_writes_the_promised_file(tmp_path: Path) -> None:
     assert {**results[0], "wall_s": 0} == {**results[1], "wall_s": 0}
 
 
+PRESSING = """\
+from services.action import error, success
+
+async def work(ctx, *, force=1.0):
+    return success() if force < 5.0 else error("too_strong")
+
+async def recover(ctx):
+    return error("no_power", "the robot has no power")
+"""
+
+
+def test_a_run_that_was_given_up_says_why(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An argument of a wrong type: its action, node and text stand in the terminal and in the JSON, and how to keep more."""
+    from coordinator.cli.new import TASK
+
+    monkeypatch.chdir(tmp_path)
+    broken = TASK.replace("{name}", "broken").replace("[places.work]", '[places.work]\nargs = { force = "x" }')
+    Path("pressing.py").write_text(PRESSING, encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    Path("broken.toml").write_text(broken, encoding="utf-8")
+    node = 'schema = 1\n[nodes.robot]\nhost = "127.0.0.1"\nport = 7399\n'
+    action = '[actions.{0}]\nrun = "pressing:{0}"\ntask = "{0}"\nnode = "robot"\n'
+    Path("services.toml").write_text(node + action.format("work") + action.format("recover"), encoding="utf-8")
+    assert main(["run", "broken.toml", "--mode", "lockstep", "--json", "out.json"]) == 1
+    said = capsys.readouterr()
+    work, recover = json.loads(Path("out.json").read_text(encoding="utf-8"))["last_errors"]
+    assert (work["run"], work["node"], recover["run"], recover["primitive_task"]) == (
+        ("work#1", "robot", "recover#1", "recover")
+    )
+    shown = "".join(said.out.split())
+    assert "TypeError" in work["text"] and recover["cause"] == "no_power"
+    for error in (work, recover):
+        assert "".join(f"{error['run']}, {error['action']} on robot".split()) in shown
+        assert "".join(error["text"].split()) in shown
+    assert "--journal" in said.err
+
+
 def test_a_task_of_ones_own_comes_before_a_shipped_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the page saved under `tasks` is found by its bare name."""
     from coordinator.cli.loading import SHIPPED, task_path
