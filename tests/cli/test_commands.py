@@ -54,6 +54,11 @@ def test_overview_and_unknown_command(capsys: pytest.CaptureFixture[str]) -> Non
         (["replay", "no_such_run"], "no run 'no_such_run'"),
         (["new", "action", "2fast"], "2fast"),
         (["calibrate", "--views", "nowhere"], "nowhere"),
+        (["nodes", "--timeout", "-1"], "--timeout: -1: give seconds"),
+        (["nodes", "--timeout", "0"], "--timeout: 0: give seconds, more than 0"),
+        (["nodes", "--timeout", "inf"], "--timeout: inf: give seconds"),
+        (["up", "--lockstep", "--await-coordinator", "-1"], "--await-coordinator: -1: give seconds"),
+        (["up", "--lockstep", "--await-coordinator", "soon"], "--await-coordinator: soon: give seconds"),
     ],
 )
 def test_bad_input_is_exit_code_2_and_names_the_fault(
