@@ -29,6 +29,7 @@ from services.comm.camera import ImageServer
 from services.comm.can_hub import Hub
 from services.comm.credentials import credentials
 from services.comm.directory import Directory, resolve
+from services.comm.listening import listening, refuse_unusable
 from services.comm.messages import Call, Outcome
 from services.comm.party import TICK
 from services.comm.server import Server
@@ -160,7 +161,7 @@ class LaboratoryShell:
         self._fault: BaseException | None = None
 
     async def start(self) -> None:
-        """Make all ready that takes long, start the world's clock, then listen. Raises OSError, KeyNeededError."""
+        """Make all ready that takes long, start the world's clock, then listen. Raises DirectoryError, KeyNeededError."""
         if self._images is not None:
             self.laboratory.make_ready({})
         gc.collect()
@@ -168,7 +169,8 @@ class LaboratoryShell:
         self._loop = asyncio.get_running_loop()
         self._thread.start()
         try:
-            await self.server.start(*self._directory.address(self._name))
+            with listening(self._directory, self._name):
+                await self.server.start(*self._directory.address(self._name))
         except BaseException:
             await self.close()
             raise
@@ -261,6 +263,7 @@ def camera_address(directory: Directory) -> tuple[str, int] | None:
 
 async def serve(directory: Directory, name: str) -> None:
     """Run the laboratory until SIGTERM or SIGINT; prints one line with `ready` when it serves."""
+    refuse_unusable(directory, name)  # a second laboratory is told of its node's address, not of its bus's
     shell = LaboratoryShell(directory, name)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
