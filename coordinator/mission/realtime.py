@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from shlex import quote
 from typing import Final
 
 from coordinator.mission.mission import Mission, MissionError, Stage
@@ -18,6 +19,9 @@ LINGER = 1.0
 LEAVE: Final = 2.5
 """Seconds after the loss of a node in which it may come back to be told good-bye: a little longer than it keeps the leases of
 one who has gone without a word (`services.comm.results.Keeping.lease`)."""
+
+KEY_CODES: Final = ("key_needed", "no_key_here", "no_key_there", "wrong_key")
+"""Refusals (docs/protocol.md) of one whose key is not that of the node."""
 
 
 class UnreachableError(Exception):
@@ -52,10 +56,20 @@ class RealtimeMission:
         reached = await asyncio.gather(*(client.connected(timeout) for client in self.clients.values()))
         missing = [name for name, up in zip(self.clients, reached, strict=True) if not up]
         if missing:
-            addresses = ", ".join(self._missed(name) for name in missing)
-            raise UnreachableError(missing, f"no answer from {addresses}; launch them with `petrobot up`")
+            raise UnreachableError(missing, "; ".join(self._missed(missing)))
 
-    def _missed(self, node: str) -> str:
+    def _missed(self, missing: Sequence[str]) -> Iterator[str]:
+        """Why nodes are not reached and what to do: those that run and refuse us need something else than to be launched."""
+        source = quote(str(self.mission.executor.directory.source))
+        refusing = [name for name in missing if self.clients[name].answered]
+        if away := [name for name in missing if name not in refusing]:
+            yield f"no answer from {', '.join(map(self._tried, away))}; launch them with `petrobot up --services {source}`"
+        if refusing:
+            keys = any(code in self.clients[name].trouble for name in refusing for code in KEY_CODES)
+            remedy = f"; give both sides the same key file: that which keys.file of {source} names" if keys else ""
+            yield f"not let in by {', '.join(map(self._tried, refusing))}{remedy}"
+
+    def _tried(self, node: str) -> str:
         client = self.clients[node]
         return f"{node} at {client.host}:{client.port}" + (f" ({client.trouble})" if client.trouble else "")
 
