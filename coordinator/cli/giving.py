@@ -44,7 +44,10 @@ def give(
 
         print_result(result)
         if folder is None and result["status"] != "success":
-            print("not kept; with --journal runs, `petrobot log` and `petrobot report` show what led there", file=sys.stderr)
+            print(
+                "not kept; with --journal runs, `petrobot log` and `petrobot report` show what led there",
+                file=sys.stderr,
+            )
     if options.report is not None:
         from coordinator.drawing import draw
         from coordinator.report import report_html
