@@ -8,6 +8,7 @@ from shlex import quote
 from typing import Final
 
 from coordinator.mission.mission import Mission, MissionError, Stage
+from coordinator.mission.punctuality import PERIOD, Punctuality
 from coordinator.record.journal import JournalError
 from services.comm.client import Client
 from services.comm.credentials import COORDINATOR, Credentials, credentials
@@ -43,6 +44,8 @@ class RealtimeMission:
         self._fault: BaseException | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._lost_at: dict[str, float] = {}
+        self._punctuality = Punctuality()
+        self._looking: asyncio.TimerHandle | None = None
         key, tls = (proves.key, proves.client()) if proves is not None else (None, None)
         self.clients: Mapping[str, Client] = {
             name: Client(node.host, node.port, mission.callers[name], on_notices=self._hear(name), key=key, tls=tls)
@@ -80,7 +83,10 @@ class RealtimeMission:
         """
         (begin or self.mission.start)(self._loop.time())
         self.settle()
+        self._look_again(self._loop.time() + PERIOD)
         await self._over.wait()
+        if remark := self._punctuality.remark():
+            self.mission.remarks["host"] = remark
         if self._fault is not None:
             raise self._fault
 
@@ -88,8 +94,9 @@ class RealtimeMission:
         """Leave the nodes in good order: each hears what was not acknowledged yet and a good-bye, which frees its devices for
         the next run at once. One that was just lost is waited for as long as it would keep them for this one."""
         self._closed = True
-        if self._timer is not None:
-            self._timer.cancel()
+        for timer in (self._timer, self._looking):
+            if timer is not None:
+                timer.cancel()
         await asyncio.gather(*(self._leave(name, client) for name, client in self.clients.items()))
 
     async def _leave(self, name: str, client: Client) -> None:
@@ -124,6 +131,14 @@ class RealtimeMission:
         if self._timer is not None:
             self._timer.cancel()
         self._timer = None if due is None else self._loop.call_at(due, self._wake)
+
+    def _look_again(self, due: float) -> None:
+        """See how late the loop comes to what is due: if it is, so are the other processes of this host."""
+
+        def look() -> None:
+            self._look_again(self._punctuality.look(due, self._loop.time()))
+
+        self._looking = self._loop.call_at(due, look)
 
     def _wake(self) -> None:
         self._guarded(lambda now: self.mission.advance(now))
