@@ -20,7 +20,7 @@ import secrets
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from typing import Final
 
@@ -137,14 +137,16 @@ class LaboratoryShell:
     """A running laboratory of one simulated node of services.toml. Between `start` and `close` it serves."""
 
     def __init__(self, directory: Directory, name: str) -> None:
-        """Raises LaboratoryError, ImportError for a `sim` that is not there, ValueError for an address that cannot be, OSError
-        for one that is taken."""
+        """Raises LaboratoryError, ImportError for a `sim` that is not there, ValueError for an address that cannot
+        be."""
         self._directory = directory
         self._name = name
         self.laboratory = _made(directory, name)
         channel, address = bus_channel(directory), camera_address(directory)
-        self._hub = Hub(channel) if channel else None
-        self._images = ImageServer(*address) if address else None
+        with _had(f"{directory.source}: the simulated bus's channel {channel}"):
+            self._hub = Hub(channel) if channel else None
+        with _had(f"{directory.source}: the simulated camera's address {':'.join(map(str, address or ()))}"):
+            self._images = ImageServer(*address) if address else None
         self.pacemaker = Pacemaker(self.laboratory, self._hub, self._images)
         offers = {
             service: Offer(inline=None if service == self.laboratory.between_ticks else self._answer)
@@ -230,6 +232,16 @@ def _made(directory: Directory, name: str) -> LaboratoryParty:
             "sim.laboratory_party.LaboratoryParty"
         )
     return made
+
+
+@contextlib.contextmanager
+def _had(what: str) -> Iterator[None]:
+    """Raises LaboratoryError in place of OSError: whoever reads it knows no errno."""
+    try:
+        yield
+    except OSError as fault:
+        why = os.strerror(fault.errno) if fault.errno else str(fault)
+        raise LaboratoryError(f"{what}: {why}; end the process that listens there, or give another port") from fault
 
 
 def bus_channel(directory: Directory) -> str:
