@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from shlex import quote
 from typing import Final
@@ -63,7 +64,7 @@ class RealtimeMission:
 
     def _missed(self, missing: Sequence[str]) -> Iterator[str]:
         """Why nodes are not reached and what to do: those that run and refuse us need something else than to be launched."""
-        source = quote(str(self.mission.executor.directory.source))
+        source = quote(os.path.normpath(self.mission.executor.directory.source))
         refusing = [name for name in missing if self.clients[name].answered]
         if away := [name for name in missing if name not in refusing]:
             yield f"no answer from {', '.join(map(self._tried, away))}; launch them with `petrobot up --services {source}`"
