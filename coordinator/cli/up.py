@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from coordinator.cli import CommandError
 from coordinator.cli.loading import add_services_argument, load_directory, refuse_misplaced
+from services.comm.durations import not_negative
 
 if TYPE_CHECKING:
     from services.comm.directory import Directory
@@ -29,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--await-coordinator",
-        type=float,
+        type=not_negative,
         default=600.0,
         metavar="S",
         help="lock step: how long a coordinator that died is waited for (%(default)g s of wall time)",
