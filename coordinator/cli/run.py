@@ -24,8 +24,10 @@ from coordinator.cli.loading import (
     load_task,
     refuse_misplaced,
 )
+from coordinator.cli.lockstep import substitutes
 from coordinator.cli.page_port import add_page_port_argument, named_port
 from coordinator.cli.parameters import pairs, parameter_of
+from coordinator.cli.quantities import whole
 
 if TYPE_CHECKING:
     from coordinator.launch import Setting
@@ -50,11 +52,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a task file, or the name of a task that comes with petrobot (with --from: that of the run)",
     )
     parser.add_argument(
-        "--runs", type=_positive, metavar="N", help="how many runs (default: tokens in the task's runs place)"
+        "--runs", type=whole(), metavar="N", help="how many runs (default: tokens in the task's runs place)"
     )
     parser.add_argument("--mode", choices=MODES, help=f"default: {MODES[0]}, with --from {MODES[1]}")
     parser.add_argument(
-        "--seed", type=int, metavar="S", help=f"of all chance in the run (default: {SEED}, with --from that of the run)"
+        "--seed",
+        type=whole(0),
+        metavar="S",
+        help=f"of all chance in the run (default: {SEED}, with --from that of the run)",
     )
     parser.add_argument("--regime", metavar="NAME", help="the same as --set regime=NAME")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the task")
@@ -114,6 +119,7 @@ def run(options: argparse.Namespace) -> int:
     _refuse_unfit(task, directory)
     if (options.mode == "lockstep" or options.up) and not options.join:
         refuse_misplaced(directory, everywhere=options.mode == "lockstep", scripted=options.mock is not None)
+    substitutes(options.mock, directory)  # refuses a script for actions that there are not
     setting = _setting(task, directory, options)
     _warn(task, options)
     begun = time.perf_counter()
@@ -138,17 +144,11 @@ def run(options: argparse.Namespace) -> int:
     return 0 if result["status"] == "success" else 1
 
 
-def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not at least 1")
-    return value
-
-
 def _refuse_unfit(task: Task, directory: Directory) -> None:
     from coordinator.check import check
 
-    report = check(task, {action: entry.node for action, entry in directory.actions.items()})
+    offers = {action: entry.node for action, entry in directory.actions.items()}
+    report = check(task, offers, source=str(directory.source))
     faults = [f for f in report.findings if f.severity == "error"]
     if faults:
         lines = "\n".join(f"  {f.key}: {f.text}\n    {f.remedy}" for f in faults)

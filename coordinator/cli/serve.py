@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
 from coordinator.cli.loading import SHIPPED, add_services_argument, load_directory
+from coordinator.cli.lockstep import substitutes
 from coordinator.cli.page_port import add_page_port_argument, named_port
 
 if TYPE_CHECKING:
@@ -53,7 +54,9 @@ def run(options: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
     if options.mock is not None and not options.up:
         raise CommandError(2, "--mock is for nodes that are launched here: give --up, too, or `petrobot up --mock`")
-    return asyncio.run(_serve(load_directory(options.services), options))
+    directory = load_directory(options.services)
+    substitutes(options.mock, directory)  # refuses a script for actions that there are not
+    return asyncio.run(_serve(directory, options))
 
 
 async def _serve(directory: Directory, options: argparse.Namespace) -> int:

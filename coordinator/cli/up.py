@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from coordinator.cli import CommandError
 from coordinator.cli.loading import add_services_argument, load_directory, refuse_misplaced
+from coordinator.cli.lockstep import substitutes
 from services.comm.durations import not_negative
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ def run(options: argparse.Namespace) -> int:
     """Launch and watch."""
     directory = load_directory(options.services)
     refuse_misplaced(directory, scripted=options.mock is not None)
+    substitutes(options.mock, directory)  # refuses a script for actions that there are not
     return asyncio.run(_up(directory, options))
 
 

@@ -66,6 +66,8 @@ def test_overview_and_unknown_command(capsys: pytest.CaptureFixture[str]) -> Non
         (["campaign", "catch_ball", "--target", "2"], "--target: 2 is not a number of more than 0 and at most 1"),
         (["learned", "show", "x.db", "--target", "7"], "--target: 7 is not a number of more than 0 and at most 1"),
         (["learned", "show", "x.db", "--rho", "-1"], "--rho: -1 is not a number of at least 0"),
+        (["token", "runs", "two"], "two changes nothing: write how many tokens"),
+        (["run", "catch_ball", "--runs", "abc"], "--runs: abc is not a whole number of at least 1"),
         (["run", "catch_ball", "--keep", "0"], "--keep: 0 is not a whole number of at least 1"),
         (["run", "catch_ball", "--target", "0"], "--target: 0 is not a number of more than 0 and at most 1"),
         (["forecast", "catch_ball", "--replicates", "5"], "--replicates: 5 is not a whole number of at least 20"),
