@@ -40,6 +40,7 @@ class Draft:
         self.breakpoints = state.breakpoints
         self.overrides = state.overrides
         self.deferred = dict(state.deferred)
+        self.early = dict(state.early)
         self.told: set[str] = set(state.told)
         self.ending = state.ending
 
@@ -66,6 +67,7 @@ class Draft:
             breakpoints=self.breakpoints,
             overrides=self.overrides,
             deferred=self.deferred,
+            early=self.early,
             told=frozenset(self.told),
             ending=self.ending,
         )

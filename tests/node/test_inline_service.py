@@ -10,14 +10,21 @@ import pytest
 from services.comm.directory import ServiceEntry
 from services.comm.messages import Call, Executed
 from services.inline_service import inline_service
+from services.runs import Judged
 
 EVENTS: list[tuple[str, str, Mapping[str, Any]]] = []
+VERDICTS: list[tuple[str, Judged]] = []
 
 
 def _call(function: str, **arguments: Any) -> Any:
     EVENTS.clear()
+    VERDICTS.clear()
     entry = ServiceEntry("it", "here", f"toy_cell.actions:{function}")
-    answer = inline_service(entry, lambda service, name, data: EVENTS.append((service, name, data)))
+    answer = inline_service(
+        entry,
+        lambda service, name, data: EVENTS.append((service, name, data)),
+        lambda service, judged: VERDICTS.append((service, judged)),
+    )
     return answer(1.5, Call("c1", "it", arguments))
 
 
