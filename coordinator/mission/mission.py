@@ -69,6 +69,11 @@ class Cycle:
         """The worst status of its runs."""
         return self.worst[0]
 
+    @property
+    def cause(self) -> str:
+        """Why it was that."""
+        return self.worst[1]
+
     def plain(self, now: float) -> dict[str, Any]:
         """Plain data; times as ages, since only durations cross the wire (s)."""
         ended = now if self.ended is None else self.ended
