@@ -35,6 +35,13 @@ def test_its_values_are_plain_and_its_events_are_told() -> None:
     assert EVENTS == [("it", "doubled", {"count": 2})]
 
 
+def test_its_verdicts_are_told() -> None:
+    """A service may judge as an action may: it is on nobody's device, and sees what all of them did."""
+    assert _call("judge", run="m/pick#1").status == "success"
+    assert [("it", Judged("c1", "m/pick#1", "failure", "crooked"))] == VERDICTS
+    assert _call("judge", run="pick").cause == "exception" and VERDICTS == []
+
+
 @pytest.mark.parametrize(
     ("function", "arguments", "cause", "executed", "says"),
     [
