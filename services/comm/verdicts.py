@@ -10,6 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
+from services.comm.frequent import NAME_LENGTH
+
 VERDICT_EVENTS: Final = "verdict:"
 """What the names of these events begin with."""
 STATUSES: Final = ("success", "failure", "error")
@@ -45,7 +47,7 @@ class VerdictSaid:
 def mission_of(run: str) -> str:
     """The mission run that a run belongs to. Raises ValueError for what is no run's id."""
     mission, _, place = run.rpartition("/") if isinstance(run, str) else ("", "", "")
-    if not mission or not place.rpartition("#")[0]:
+    if not mission or not place.rpartition("#")[0] or len(run) > NAME_LENGTH:
         raise ValueError(f"{run!r} is no run that can be judged; give what its own context gave as ctx.run")
     return mission
 

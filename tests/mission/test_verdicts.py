@@ -351,7 +351,7 @@ def test_a_run_that_was_sure_or_never_executed_is_not_to_be_judged() -> None:
         assert not ended.deferred and not bench.executor.state.deferred
 
 
-@pytest.mark.parametrize("run", ["", "work#1", "m/work", "m/work#1/2", "m/#1", None, 7])
+@pytest.mark.parametrize("run", ["", "work#1", "m/work", "m/work#1/2", "m/#1", "m" * 255 + "/a#1", None, 7])
 def test_what_is_no_runs_id_is_refused_where_it_is_said(run: Any) -> None:
     with pytest.raises(ValueError, match="give what its own context gave as ctx"):
         mission_of(run)
