@@ -14,7 +14,7 @@ their context, so the same code runs in a warm worker process on the wall clock 
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any, Protocol
 
@@ -44,6 +44,8 @@ class Result:
     values: Mapping[str, Any] = field(default_factory=dict)
     cause: str = ""
     text: str = ""
+    deferred: bool = False
+    """The status is provisional: it routes the task now, and a later verdict may correct it once for the estimates."""
 
 
 def success(**values: Any) -> Result:
@@ -59,6 +61,12 @@ def failure(cause: str, text: str = "", **values: Any) -> Result:
 def error(cause: str, text: str = "", **values: Any) -> Result:
     """The specification was not met; the task goes on along its error branch."""
     return Result(Status.ERROR, values, cause, text)
+
+
+def provisional(result: Result) -> Result:
+    """The same result, as far as is known yet: it routes the task now, and a later verdict (`Context.verdict`, or the
+    task's score) may correct its status once, for the estimates alone. If none comes it stands."""
+    return replace(result, deferred=True)
 
 
 class Cancelled(BaseException):
@@ -114,6 +122,10 @@ class Context(Protocol):
 
     def raise_event(self, name: str, **data: Any) -> None:
         """Raise a named internal event while the run goes on."""
+
+    def verdict(self, run: str, status: Status, cause: str = "", text: str = "") -> None:
+        """Judge an earlier run whose result was `provisional`: its status is corrected once, for the estimates
+        alone. `run` is what that run's own context gave as `ctx.run`; on whichever node either of them lives."""
 
     def progress(self, fraction: float, **data: Any) -> None:
         """Tell the coordinator how far the run is, 0 to 1, with plain data for people to look at."""

@@ -11,8 +11,9 @@ import numpy as np
 
 from services.action import Result, Status, Wait
 from services.comm.plain import plain
+from services.comm.verdicts import mission_of
 from services.outlets import Outlets
-from services.runs import Answered, Asked, Begin, Dropped, Progressed, Raised, Report
+from services.runs import Answered, Asked, Begin, Dropped, Judged, Progressed, Raised, Report
 
 
 class CallFailed(Exception):  # noqa: N818 - what happened, not a class of errors
@@ -85,6 +86,11 @@ class RunContext:
     def raise_event(self, name: str, **data: Any) -> None:
         """Raise a named internal event while the run goes on."""
         self._report(Raised(self.run, name, plain(data, "data")))
+
+    def verdict(self, run: str, status: Status, cause: str = "", text: str = "") -> None:
+        """Judge an earlier run that had ended provisionally. Raises ValueError for what is no run's id or no status."""
+        mission_of(run)
+        self._report(Judged(self.run, run, Status(status).value, str(cause), str(text)))
 
     def progress(self, fraction: float, **data: Any) -> None:
         """Tell how far the run is, 0 to 1 (clipped)."""

@@ -14,13 +14,15 @@ from services.comm.messages import Call, Executed, Outcome
 from services.comm.plain import NotPlainError, plain
 from services.context import RunContext
 from services.outlets import Outlets
-from services.runs import Begin, Raised, Report
+from services.runs import Begin, Judged, Raised, Report
 
 EventSink = Callable[[str, str, Mapping[str, Any]], None]
 """Takes (service, event, data) of an event that a service raises."""
+VerdictSink = Callable[[str, Judged], None]
+"""Takes (service, verdict) of a verdict that a service gives on an earlier run."""
 
 
-def inline_service(service: ServiceEntry, raised: EventSink) -> Inline:
+def inline_service(service: ServiceEntry, raised: EventSink, judged: VerdictSink) -> Inline:
     """The callee's end of such a service. Raises ImportError when its function cannot be loaded.
 
     The function takes a context and keyword arguments like an action; of its context it may use what does not wait.
@@ -30,6 +32,8 @@ def inline_service(service: ServiceEntry, raised: EventSink) -> Inline:
     def report(told: Report) -> None:
         if isinstance(told, Raised):
             raised(service.name, told.name, told.data)
+        elif isinstance(told, Judged):
+            judged(service.name, told)
 
     def answer(now: float, call: Call) -> Outcome:
         context = RunContext(Begin(call.id, service.name, call.arguments), None, lambda: now, Outlets({}), report)

@@ -15,6 +15,7 @@ from services.comm.latch import Latch
 from services.comm.messages import Call, Executed, Hello, Outcome
 from services.comm.notice import Ended as CallEnded
 from services.comm.notice import Notice
+from services.comm.verdicts import VerdictSaid, mission_of, verdict_event
 from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
 from services.device import PICTURE
 from services.emergency_stops import NEVER, EmergencyStops
@@ -22,7 +23,7 @@ from services.inline_service import inline_service
 from services.memory import Memory, event_name
 from services.place import InlinePlace, Place
 from services.remote import CLEAR_EMERGENCY, EMERGENCY_STOP, IN_EMERGENCY
-from services.runs import Answered, Asked, Begin, Dropped, Ended, Progressed, Raised, Report, Sent, Stop, Told
+from services.runs import Answered, Asked, Begin, Dropped, Ended, Judged, Progressed, Raised, Report, Sent, Stop, Told
 from services.timers import Timers
 
 GENERAL = ""
@@ -115,7 +116,7 @@ class Node:
             return {call: Offer(scope, inline=self._memory_call) for call in MEMORY_CALLS}
         if waits or not service.run:
             return {service.name: Offer(scope)}
-        inline: Inline = inline_service(service, self._service_event)
+        inline: Inline = inline_service(service, self._service_event, self._judge)
         return {service.name: Offer(scope, inline=inline)}
 
     def caller(self, peer: str) -> Caller:
@@ -274,6 +275,8 @@ class Node:
             self.sent.append((self.action_of(report.run), report))
         elif isinstance(report, Raised):
             self._raise(now, key, report)
+        elif isinstance(report, Judged):
+            self._judge(self.action_of(report.by), report)
         elif isinstance(report, Told):
             if report.id in self._commands:
                 command = self._commands[report.id]
@@ -293,7 +296,16 @@ class Node:
             caller.cancel_children(now, end.id, "its run is over")
         executed = Executed(end.executed)
         self.callee.finish(
-            now, end.id, end.status, end.values, end.cause, end.text, executed, end.seconds, end.cpu_seconds
+            now,
+            end.id,
+            end.status,
+            end.values,
+            end.cause,
+            end.text,
+            executed,
+            end.seconds,
+            end.cpu_seconds,
+            end.deferred,
         )
 
     def _raise(self, now: float, key: str, raised: Raised) -> None:
@@ -302,6 +314,12 @@ class Node:
         elif raised.run in self._at:
             source = self.action_of(raised.run)
             self.callee.raise_event(now, raised.name, raised.data, source=source, latched=True, run=raised.run)
+
+    def _judge(self, source: str, judged: Judged) -> None:
+        """The verdict goes to the coordinator of the judged run: latched, so that a lost link only delays it."""
+        said = VerdictSaid(judged.run, judged.status, judged.cause, judged.text)
+        name = verdict_event(mission_of(judged.run))
+        self.callee.raise_event(self._now, name, said.to_data(), source=source, latched=True)
 
     def _ask(self, now: float, key: str, asked: Asked) -> None:
         try:

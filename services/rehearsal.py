@@ -11,7 +11,7 @@ from services.comm.directory import MEMORY_CALLS, ActionEntry
 from services.comm.party import TICK
 from services.memory import Memory
 from services.place import InlinePlace
-from services.runs import Answered, Asked, Begin, Ended, Progressed, Raised, Report, Sent, Stop
+from services.runs import Answered, Asked, Begin, Ended, Judged, Progressed, Raised, Report, Sent, Stop
 
 NAME, RUN = "action", "rehearsal"
 
@@ -33,6 +33,8 @@ class Rehearsal:
     """(time, fraction)."""
     calls: list[tuple[float, str, Mapping[str, Any]]] = field(default_factory=list)
     """Calls of services: (time, service, arguments)."""
+    verdicts: list[tuple[float, str, Status, str]] = field(default_factory=list)
+    """Verdicts on earlier runs: (time, run, status, cause)."""
     memory: Memory = field(default_factory=lambda: Memory(lambda name, value, version: None))
 
 
@@ -119,12 +121,15 @@ class _Stage:
     def _note(self, report: Report) -> None:
         played = self.played
         if isinstance(report, Ended):
-            played.result = Result(Status(report.status), report.values, report.cause, report.text)
+            said = (report.values, report.cause, report.text, report.deferred)
+            played.result = Result(Status(report.status), *said)
             played.seconds = report.seconds
         elif isinstance(report, Sent):
             played.published.append((self.now, report.stream, report.values))
         elif isinstance(report, Raised):
             played.events.append((self.now, report.name, report.data))
+        elif isinstance(report, Judged):
+            played.verdicts.append((self.now, report.run, Status(report.status), report.cause))
         elif isinstance(report, Progressed):
             played.progress.append((self.now, report.fraction))
         elif isinstance(report, Asked):

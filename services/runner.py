@@ -230,7 +230,8 @@ class Runner:
             return
         try:
             values = plain(returned.values, "result")
-            result = Result(Status(returned.status), values, str(returned.cause), str(returned.text))
+            said = (str(returned.cause), str(returned.text), bool(returned.deferred))
+            result = Result(Status(returned.status), values, *said)
         except (TypeError, ValueError) as fault:
             self._give_up(now, run, "bad_result", str(fault))
             return
@@ -288,10 +289,8 @@ class Runner:
         identity = run.begin.id
         self._outlets.close(identity)
         del self._runs[identity]
-        took = now - run.started
-        self._reports.append(
-            Ended(identity, result.status, result.values, result.cause, result.text, Executed.YES, took, run.cpu)
-        )
+        said = (result.status, result.values, result.cause, result.text, Executed.YES)
+        self._reports.append(Ended(identity, *said, now - run.started, run.cpu, result.deferred))
 
     def _hold(self, now: float, frozen: bool) -> None:
         """Freeze the runs, or let them go on with all their times moved by the pause."""

@@ -65,6 +65,20 @@ class Ended:
     executed: str = Executed.YES
     seconds: float = 0.0
     cpu_seconds: float = 0.0
+    deferred: bool = False
+    """Its status is provisional."""
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """The verdict of run `by` on an earlier run that had ended provisionally."""
+
+    KIND: ClassVar[str] = "judged"
+    by: str
+    run: str
+    status: str
+    cause: str = ""
+    text: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,9 +144,10 @@ class Told:
 
 
 Order = Begin | Stop | Answered | Hold
-Report = Ended | Progressed | Raised | Asked | Dropped | Sent | Told
+Report = Ended | Judged | Progressed | Raised | Asked | Dropped | Sent | Told
 _RECORDS: dict[str, type[Order] | type[Report]] = {
-    kind.KIND: kind for kind in (Begin, Stop, Answered, Hold, Ended, Progressed, Raised, Asked, Dropped, Sent, Told)
+    kind.KIND: kind
+    for kind in (Begin, Stop, Answered, Hold, Ended, Judged, Progressed, Raised, Asked, Dropped, Sent, Told)
 }
 
 

@@ -26,7 +26,7 @@ from typing import Any
 from services.action import Context, Result, Status
 from services.comm.directory_file import nearest
 
-_KEYS = ("status", "seconds", "values", "cause", "text", "events")
+_KEYS = ("status", "seconds", "values", "cause", "text", "events", "deferred")
 _EVENT_KEYS = ("after", "name", "data")
 
 
@@ -53,6 +53,8 @@ class Line:
     cause: str = ""
     text: str = ""
     events: tuple[Cue, ...] = ()
+    deferred: bool = False
+    """Its status is provisional."""
 
 
 class Scripted:
@@ -80,7 +82,7 @@ async def _play(ctx: Context, line: Line) -> Result:
         ctx.raise_event(cue.name, **cue.data)
     if begun + seconds > ctx.now:
         await ctx.sleep(begun + seconds - ctx.now)
-    return Result(line.status, line.values, line.cause, line.text)
+    return Result(line.status, line.values, line.cause, line.text, line.deferred)
 
 
 def load(path: str | Path) -> dict[str, Callable[..., Any]]:
@@ -115,7 +117,7 @@ def _top_faults(data: Mapping[str, Any]) -> Iterable[str]:
 
 def _line(table: Any) -> Line:
     if not isinstance(table, dict):
-        raise ValueError(f"is {table!r}; write a table with status, seconds, values, cause, text, events")
+        raise ValueError(f"is {table!r}; write a table with {', '.join(_KEYS)}")
     for key in table:
         if key not in _KEYS:
             raise ValueError(f"unknown key {key!r}{nearest(key, _KEYS)}")
@@ -127,7 +129,10 @@ def _line(table: Any) -> Line:
         raise ValueError(f"values is {values!r}; write a table")
     cues = tuple(_cue(cue) for cue in table.get("events", ()))
     cause, text = str(table.get("cause", "")), str(table.get("text", ""))
-    return Line(Status(status), _seconds(table.get("seconds", 0.0)), values, cause, text, cues)
+    deferred = table.get("deferred", False)
+    if not isinstance(deferred, bool):
+        raise ValueError(f"deferred is {deferred!r}; write true if its status is provisional")
+    return Line(Status(status), _seconds(table.get("seconds", 0.0)), values, cause, text, cues, deferred)
 
 
 def _seconds(value: Any) -> tuple[float, float]:

@@ -20,6 +20,9 @@ from services.comm.notice import Progress
 DIGITS = 6
 """Decimals of every time and cost in the table (us)."""
 
+_RANK = {status: n for n, status in enumerate(("", *(status.value for status in Status)))}
+"""How bad a status is."""
+
 CostOf = Callable[[RunRecorded, Mapping[str, Any]], float | None]
 """Cost of a run that was recorded, from its record and the values of its result."""
 
@@ -118,6 +121,10 @@ class ThrowLog:
         self._entries: dict[str, tuple[Throw, RunEntry]] = {}
         self._going: dict[str, float] = {}
         self._values: dict[str, Mapping[str, Any]] = {}
+        self._ends: dict[int, list[RunEntry]] = {}
+        """By throw: its runs in the order in which they ended."""
+        self._given_up: str | None = None
+        """Why the mission run ended before its last throw was completed, if it did."""
         self._origin: float | None = None
 
     # --- an observer -------------------------------------------------------------------------------------------------
@@ -141,8 +148,7 @@ class ThrowLog:
         elif isinstance(instruction, RunRecorded):
             self._recorded(now, instruction)
         elif isinstance(instruction, Corrected) and instruction.run in self._entries:
-            entry = self._entries[instruction.run][1]
-            entry.status, entry.cause = instruction.status.value, instruction.cause
+            self._corrected(instruction)
         elif isinstance(instruction, Finished):
             self._finished(now, instruction)
 
@@ -226,9 +232,24 @@ class ThrowLog:
         cost = self._cost_of(record, values)
         entry.cost = None if cost is None else round(cost, DIGITS)
         self._since[record.place] = now
-        rank = ("", *(status.value for status in Status))
-        if rank.index(entry.status) > rank.index(throw.status):
+        self._ends.setdefault(throw.k, []).append(entry)
+        if _RANK[entry.status] > _RANK[throw.status]:
             throw.status, throw.cause = entry.status, entry.cause
+
+    def _corrected(self, corrected: Corrected) -> None:
+        """The verdict on a run replaces its status, and the throw is what its runs really came to."""
+        throw, entry = self._entries[corrected.run]
+        entry.status, entry.text = corrected.status.value, corrected.text or entry.text
+        entry.cause = corrected.cause if corrected.status is not Status.SUCCESS else ""
+        worst = max(self._ends[throw.k], key=lambda one: _RANK[one.status])
+        bad = _RANK[worst.status] > _RANK[Status.SUCCESS.value]
+        throw.status, throw.cause = (worst.status, worst.cause) if bad else (Status.SUCCESS.value, "")
+        if throw is self.throws[-1]:
+            self._give_up(throw)
+
+    def _give_up(self, last: Throw) -> None:
+        if self._given_up is not None:
+            last.status, last.cause = Status.ERROR.value, last.cause or self._given_up
 
     def _finished(self, now: float, finished: Finished) -> None:
         if not self.throws:
@@ -238,7 +259,8 @@ class ThrowLog:
         if last.completed and last.time is None:
             last.time = self._span(now, last)
         if not last.completed:
-            last.status, last.cause = Status.ERROR.value, last.cause or finished.reason
+            self._given_up = finished.reason
+            self._give_up(last)
 
 
 def _numbers(values: Mapping[str, Any]) -> dict[str, float]:

@@ -66,7 +66,7 @@ def _write(path: str, lines: Iterator[str]) -> None:
 
 
 def _text(found: Recorded) -> Iterator[str]:
-    from coordinator.engine import Finished, Fired, Report, RunRecorded, StartRun
+    from coordinator.engine import Corrected, Finished, Fired, Report, RunRecorded, StartRun
 
     header, net = found.journal.header, found.engine.compiled.net
     yield f"{header['mission']}  {header['date']}  {header['mode']}  seed {header['seed']}"
@@ -81,7 +81,11 @@ def _text(found: Recorded) -> Iterator[str]:
                 yield f"{when}started  {one.run:20} {one.action}"
             elif isinstance(one, RunRecorded):
                 why = f"  {one.cause}: {one.text}" if one.cause else ""
-                yield f"{when}ended    {one.run:20} {one.status.value.upper() if one.status else 'preempted'}{why}"
+                said = "provisional " * one.deferred + (one.status.value.upper() if one.status else "preempted")
+                yield f"{when}ended    {one.run:20} {said}{why}"
+            elif isinstance(one, Corrected):
+                why = f"  {one.cause}: {one.text}".rstrip(": ") if one.cause else ""
+                yield f"{when}judged   {one.run:20} {one.status.value.upper()}, was {one.was.value.upper()}{why}"
             elif isinstance(one, Report):
                 yield f"{when}{one.severity.value:8} {one.of:20} {one.text}"
             elif isinstance(one, Finished):

@@ -39,7 +39,8 @@ class Draft:
         self.backlog = list(state.backlog)
         self.breakpoints = state.breakpoints
         self.overrides = state.overrides
-        self.deferred = dict(state.deferred)
+        self.deferred = state.deferred  # like `early` replaced when it changes, which is seldom: it may grow long
+        self.early = state.early
         self.told: set[str] = set(state.told)
         self.ending = state.ending
 
@@ -66,6 +67,7 @@ class Draft:
             breakpoints=self.breakpoints,
             overrides=self.overrides,
             deferred=self.deferred,
+            early=self.early,
             told=frozenset(self.told),
             ending=self.ending,
         )

@@ -150,6 +150,7 @@ class Corrected:
     was: Status
     status: Status
     cause: str = ""
+    text: str = ""
 
 
 @dataclass(frozen=True, slots=True)

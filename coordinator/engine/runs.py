@@ -8,7 +8,7 @@ from coordinator.conditions.wording import Severity
 from coordinator.engine.draft import Draft
 from coordinator.engine.firing import verdict_variables
 from coordinator.engine.instructions import Choose, Corrected, RunRecorded, StartRun, Subject
-from coordinator.engine.state import ACTIVE, UNSTARTED, Deferred, Phase, Run
+from coordinator.engine.state import ACTIVE, UNSTARTED, Deferred, Early, Phase, Run
 from coordinator.engine.stimuli import RunEnded, StopConfirmed, StopFailed, Verdict
 from coordinator.task import Counts, Executed, Reference, Start, Status, Value
 
@@ -61,8 +61,11 @@ def end_run(draft: Draft, run: Run, end: RunEnded) -> None:
     for name, value in verdict_variables(done).items():
         draft.write(name, value)
     if end.deferred:
-        draft.deferred[run.id] = Deferred(run.place, run.action, end.status)
+        draft.deferred = {**draft.deferred, run.id: Deferred(run.place, run.action, end.status, end.cause)}
     _record(draft, run, end.status, end, cancelled=False)
+    early = _take_early(draft, run)
+    if early is not None:
+        correct(draft, Verdict(run.id, early.status, early.cause, early.text))
 
 
 def end_stopping(draft: Draft, run: Run, end: RunEnded) -> None:
@@ -91,17 +94,38 @@ def fail_stop(draft: Draft, run: Run, stop: StopFailed) -> None:
 
 
 def correct(draft: Draft, verdict: Verdict) -> None:
-    """A deferred verdict: once, and for the estimates alone."""
-    known = draft.deferred.pop(verdict.run, None)
-    if known is None:
-        draft.report(Severity.NOTE, "no_verdict_due", f"no verdict is due on {verdict.run}", verdict.run)
+    """A deferred verdict: once, and for the estimates alone. It may come from another node, and overtake the run's end."""
+    known = draft.deferred.get(verdict.run)
+    if known is not None:
+        draft.deferred = {run: open_ for run, open_ in draft.deferred.items() if run != verdict.run}
+        cause = verdict.cause or (known.cause if verdict.status is known.status else "")
+        was = (known.place, known.action, known.status)
+        draft.emit(Corrected(verdict.run, *was, verdict.status, cause, verdict.text))
         return
-    draft.emit(Corrected(verdict.run, known.place, known.action, known.status, verdict.status, verdict.cause))
+    run = draft.find(verdict.run)
+    if run is not None and run.phase in ACTIVE and run.id not in draft.early:
+        draft.early = {**draft.early, run.id: Early(verdict.status, verdict.cause, verdict.text)}
+    else:
+        _no_verdict_due(draft, verdict.run)
+
+
+def _no_verdict_due(draft: Draft, run: str) -> None:
+    draft.report(Severity.NOTE, "no_verdict_due", f"no verdict is due on {run}", run)
 
 
 def _forget(draft: Draft, run: Run) -> None:
     del draft.stopping[run.id]
     draft.touch(draft.compiled.action_places[run.place])
+    if _take_early(draft, run) is not None:
+        _no_verdict_due(draft, run.id)
+
+
+def _take_early(draft: Draft, run: Run) -> Early | None:
+    """The verdict that overtook the run's end, which has come now."""
+    early = draft.early.get(run.id)
+    if early is not None:
+        draft.early = {known: one for known, one in draft.early.items() if known != run.id}
+    return early
 
 
 def _record(draft: Draft, run: Run, status: Status | None, end: RunEnded, cancelled: bool) -> None:

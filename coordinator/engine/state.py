@@ -121,6 +121,16 @@ class Deferred:
     place: str
     action: str
     status: Status
+    cause: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Early:
+    """A verdict that overtook the end of its run."""
+
+    status: Status
+    cause: str = ""
+    text: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,6 +167,9 @@ class State:
     overrides: Mapping[str, str] = field(default_factory=dict)
     """By primitive task: the alternative that the operator has fixed."""
     deferred: Mapping[str, Deferred] = field(default_factory=dict)
+    """Runs that ended provisionally and were not judged yet."""
+    early: Mapping[str, Early] = field(default_factory=dict)
+    """Verdicts on runs whose ends are still to come."""
     told: frozenset[str] = frozenset()
     """Elements of standing reports that were made already."""
     ending: str = ""

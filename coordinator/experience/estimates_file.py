@@ -11,8 +11,8 @@ from __future__ import annotations
 import json
 import secrets
 import sqlite3
-from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,11 @@ from typing import Any
 from coordinator.learning.estimate import Key, Tally
 from coordinator.learning.estimate import merge as merge_tallies
 from coordinator.learning.joining import joined, trials
-from coordinator.learning.learning import Estimates
+from coordinator.learning.learning import Estimates, corrected
 from coordinator.learning.moments import Moments
 from coordinator.learning.passage import Flow, PassageKey
 from coordinator.learning.passage import merge as merge_flows
+from coordinator.learning.records import Correction
 
 SCHEMA = 1
 APPLICATION = 0x70657472
@@ -34,6 +35,8 @@ MACHINE_ID = Path("/etc/machine-id")
 """Tells machines apart (machine-id(5)); where there is none, the file's inode alone tells copies apart."""
 CHOICE = "choice of "
 """Before a primitive task's name in the table `forgotten`: its selectors' states are forgotten, not its estimates."""
+COUNTED = "counted "
+"""Before a mission run's id in the table `about`: the origin under which its runs were counted when it was interrupted."""
 
 TABLES = """
 CREATE TABLE about(name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
@@ -117,14 +120,19 @@ class EstimatesFile:
         selectors: Mapping[str, Mapping[str, Any]],
         mission: str = "",
         records: int | None = None,
+        late: Iterable[Correction] = (),
     ) -> None:
         """Add what a session gained to this file's own origin, and keep its selectors' states (primitive task -> state).
 
         `mission`, `records`: remember that so many records of a mission run are counted, so that none counts twice when it is
-        resumed (None: it has ended, nothing need be remembered).
+        resumed (None: it has ended, nothing need be remembered). `late`: verdicts on runs that this file counted before; what
+        was reset meanwhile, or came along with a copied file, stays as it is.
         """
         with self._writing() as db:
             origin = _about(db, "origin")
+            if _counted_by(db, mission) == origin:
+                for correction in late:
+                    _correct_tally(db, origin, correction)
             for key, tally in gained.tallies.items():
                 _add_tally(db, origin, key, tally)
             for where, flow in gained.flows.items():
@@ -133,8 +141,10 @@ class EstimatesFile:
                 _put_selector(db, task, state)
             db.execute("UPDATE about SET value = CAST(value AS INTEGER) + 1 WHERE name = 'generation'")
             db.execute("DELETE FROM mission WHERE id = ?", (mission,))
+            db.execute("DELETE FROM about WHERE name = ?", (COUNTED + mission,))
             if records is not None:
                 db.execute("INSERT INTO mission VALUES (?, ?)", (mission, records))
+                db.execute("INSERT INTO about VALUES (?, ?)", (COUNTED + mission, origin))
 
     def put_selectors(self, selectors: Mapping[str, Mapping[str, Any]]) -> None:
         """Replace selectors' states (freezing, overriding by hand)."""
@@ -274,11 +284,31 @@ def _about(db: sqlite3.Connection, name: str) -> str:
 
 
 def _add_tally(db: sqlite3.Connection, origin: str, key: Key, gained: Tally) -> None:
+    _put_tally(db, origin, key, merge_tallies(_own_tally(db, origin, key), gained))
+
+
+def _correct_tally(db: sqlite3.Connection, origin: str, correction: Correction) -> None:
+    key = Key(correction.primitive_task, correction.action, correction.context)
+    with suppress(KeyError):  # the run is not among this origin's any more
+        _put_tally(db, origin, key, corrected(_own_tally(db, origin, key), correction))
+
+
+def _counted_by(db: sqlite3.Connection, mission: str) -> str:
+    """The origin under which the runs of an interrupted mission run were counted; empty if none was."""
+    row = db.execute("SELECT value FROM about WHERE name = ?", (COUNTED + mission,)).fetchone()
+    return str(row[0]) if row else ""
+
+
+def _own_tally(db: sqlite3.Connection, origin: str, key: Key) -> Tally:
     where = (origin, key.primitive_task, key.action, key.context)
     row = db.execute(
         "SELECT body FROM tally WHERE origin = ? AND primitive_task = ? AND action = ? AND context = ?", where
     ).fetchone()
-    tally = merge_tallies(_tally(row[0]) if row else Tally(), gained)
+    return _tally(row[0]) if row else Tally()
+
+
+def _put_tally(db: sqlite3.Connection, origin: str, key: Key, tally: Tally) -> None:
+    where = (origin, key.primitive_task, key.action, key.context)
     body = json.dumps(tally.to_plain(), separators=(",", ":"))
     db.execute("INSERT OR REPLACE INTO tally VALUES (?, ?, ?, ?, ?, ?)", (*where, tally.changes, body))
 

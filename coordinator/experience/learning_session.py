@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from coordinator.experience.estimates_file import EstimatesError, EstimatesFile,
 from coordinator.experience.learner import Contexts, LearningSelector, usual_contexts
 from coordinator.learning.learning import Estimates, Learning
 from coordinator.learning.objective import Question
+from coordinator.learning.records import Correction, End
 from coordinator.learning.selectors import DEFAULT, RULES
 from coordinator.task import Task
 
@@ -96,16 +97,21 @@ class LearningSession:
         if self.setting.frozen:
             return 0
         done = self.file.records_of(self._token)
-        gained = self.learning.gained if not done else self._gained_after(done)
+        gained, late = (self.learning.gained, ()) if not done else self._gained_after(done)
         counted = len(self.selector.records) if interrupted else None
-        self.file.add(gained, self.learning.state(), self._token, counted)
+        self.file.add(gained, self.learning.state(), self._token, counted, late)
         return sum(t.runs + t.censored for t in gained.tallies.values())
 
-    def _gained_after(self, done: int) -> Estimates:
-        gained = Estimates()
+    def _gained_after(self, done: int) -> tuple[Estimates, Sequence[Correction]]:
+        """What came after so many records, and the verdicts in it on runs that the file has counted already."""
+        counted = {id(record.outcome) for record in self.selector.records[:done] if isinstance(record, End)}
+        gained, late = Estimates(), []
         for record in self.selector.records[done:]:
-            gained.apply(record, self.learning.task.name, self.learning.salt)
-        return gained
+            if isinstance(record, Correction) and id(record.was) in counted:
+                late.append(record)
+            else:
+                gained.apply(record, self.learning.task.name, self.learning.salt)
+        return gained, late
 
 
 def _learning(

@@ -61,6 +61,11 @@ def _ended(state: State, change: Change) -> None:
         _append(state, "ended", {**run, **extra}, ENDED_KEPT)
 
 
+def _judged(state: State, change: Change) -> None:
+    said = {key: change[key] for key in ("status", "reason") if key in change}
+    state["ended"] = [{**run, **said} if run["id"] == change["id"] else run for run in state["ended"]]
+
+
 def _progress(state: State, change: Change) -> None:
     run = state["runs"].get(change["id"])
     if run is not None:
@@ -94,6 +99,7 @@ _RULES: dict[str, Callable[[State, Change], None]] = {
     "run_started": lambda s, c: s["runs"].update({c["run"]["id"]: c["run"]}),
     "run_progress": _progress,
     "run_ended": _ended,
+    "run_judged": _judged,
     "node": _entry("nodes", "node"),
     "event": _entry("events", "event"),
     "variable": _entry("variables", "value"),

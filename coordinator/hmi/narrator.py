@@ -10,6 +10,7 @@ from coordinator.engine import (
     Abort,
     CancelRun,
     Chosen,
+    Corrected,
     EventOccurred,
     Finished,
     Fired,
@@ -37,7 +38,7 @@ from coordinator.hmi.feed import Feed
 from coordinator.hmi.picture import picture
 from coordinator.hmi.telling import plain_value, reason_of, told
 from coordinator.net import Marking
-from coordinator.task import End, Scope, Task
+from coordinator.task import End, Executed, Scope, Task
 from services.comm.notice import Progress
 
 _AFTER_HOLD = {Hold.HELD: "held", Hold.CANNOT: "running", Hold.STOPPED: "stopping"}
@@ -76,6 +77,7 @@ class Narrator:
             HoldRun: lambda t, i: self._state(t, i.run, "holding"),
             ReleaseRun: lambda t, i: self._state(t, i.run, "running"),
             RunRecorded: self._recorded,
+            Corrected: self._corrected,
             Report: self._report,
             Paused: self._paused,
             Resumed: lambda t, i: self.feed.emit("paused", time=t, paused=None),
@@ -234,6 +236,10 @@ class Narrator:
             "run_ended", time=time, id=record.run, status=status, ended=round(time, 4), reason=reason,
             cancelled=record.cancelled,
         )  # fmt: skip
+
+    def _corrected(self, time: float, corrected: Corrected) -> None:
+        reason = reason_of(corrected.status, corrected.cause, corrected.text, Executed.YES)
+        self.feed.emit("run_judged", time=time, id=corrected.run, status=corrected.status.value, reason=reason)
 
     def _report(self, time: float, report: Report) -> None:
         if report.severity is not Severity.NOTE:

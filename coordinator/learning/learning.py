@@ -23,6 +23,11 @@ from coordinator.task import Task
 NOTHING = Tally()
 
 
+def corrected(tally: Tally, record: Correction) -> Tally:
+    """A tally after a verdict on one of its runs. Raises KeyError if it holds no such run."""
+    return tally.correcting(record.was, record.status, record.cause)
+
+
 @dataclass
 class Estimates:
     """Tallies and flows of one counter: a machine's file, or what one session has gained."""
@@ -59,7 +64,7 @@ class Estimates:
             self.tallies[key] = self.tally(key).adding(record.outcome, salt)
         elif isinstance(record, Correction):
             key = Key(record.primitive_task, record.action, record.context)
-            self.tallies[key] = self.tally(key).correcting(record.was, record.status, record.cause)
+            self.tallies[key] = corrected(self.tally(key), record)
         elif isinstance(record, Passage):
             where = PassageKey(task, record.transition, record.context)
             self.flows[where] = self.flows.get(where, Flow()).adding(record.waited)

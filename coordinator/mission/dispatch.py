@@ -376,5 +376,6 @@ def _run_ended(run: str, outcome: Outcome) -> RunEnded:
         Executed(outcome.executed),
         dict(outcome.values),
         outcome.seconds,
-        cpu_seconds=outcome.cpu_seconds or None,
+        outcome.deferred and Executed(outcome.executed) is Executed.YES,
+        outcome.cpu_seconds or None,
     )

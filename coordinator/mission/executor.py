@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -24,15 +25,16 @@ from coordinator.engine.instructions import (
     StartRun,
     Subject,
 )
-from coordinator.engine.stimuli import Chosen, EventOccurred, RunRaised, Stimulus, VariableChanged
+from coordinator.engine.stimuli import Chosen, EventOccurred, RunRaised, Stimulus, VariableChanged, Verdict
 from coordinator.mission.dispatch import Dispatch
 from coordinator.mission.partners import FirstAlternative, Forgetful, Observer, Selector, Store
 from coordinator.record.recording import Step
-from coordinator.task import Scope, Task
+from coordinator.task import Scope, Status, Task
 from services.comm.caller import Caller
 from services.comm.directory import Directory
 from services.comm.messages import Answer, Event, Outcome
 from services.comm.notice import Accepted, Answered, Ended, EventArrived, Late, Notice, PeerBack, Progress
+from services.comm.verdicts import VERDICT_EVENTS, VerdictSaid, verdict_event
 
 MEMORY_EVENTS: Final = "memory:"
 SYNC_WITHIN: Final = 0.5
@@ -70,8 +72,9 @@ class Executor:
     # --- in --------------------------------------------------------------------------------------------------------
 
     def subscribe(self, now: float) -> None:
-        """Have the events and variables that the task knows sent by every node."""
-        names = sorted(self._external | {MEMORY_EVENTS + name for name in self.task.flat.variables})
+        """Have the events and variables that the task knows, and verdicts on its runs, sent by every node."""
+        known = self._external | {MEMORY_EVENTS + name for name in self.task.flat.variables}
+        names = sorted(known | {verdict_event(self.mission)})
         for caller in self.callers.values():
             caller.subscribe(now, names)
 
@@ -213,12 +216,19 @@ class Executor:
         if event.name.startswith(MEMORY_EVENTS):
             name = event.name.removeprefix(MEMORY_EVENTS)
             self._queue.append(VariableChanged(name, event.data.get("value"), event.source))
+        elif event.name.startswith(VERDICT_EVENTS):
+            with suppress(ValueError):  # a foreign node's mistake; nobody here could mend it
+                self._queue.append(self.verdict(VerdictSaid.of_data(event.data)))
         elif event.run:
             run = self.dispatch.run_of(event.run)
             if run is not None:
                 self._queue.append(RunRaised(run, event.name))
         elif event.name in self._external and (event.number or self.engine.awaits(self.state, event.name)):
             self._queue.append(EventOccurred(event.name, event.source, event.number))
+
+    def verdict(self, said: VerdictSaid) -> Verdict:
+        """What somebody says of a run, as the engine takes it. One on another mission run's run names none of this one."""
+        return Verdict(said.run.removeprefix(f"{self.mission}/"), Status(said.status), said.cause, said.text)
 
     def _progress(self, now: float, notice: Progress) -> None:
         run = self.dispatch.run_of(notice.id)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
 from coordinator.engine import Mode, State
-from coordinator.engine.instructions import Fired, Instruction, Report, RunRecorded, Severity, StartRun
+from coordinator.engine.instructions import Corrected, Fired, Instruction, Report, RunRecorded, Severity, StartRun
 from coordinator.engine.stimuli import Begin, Point, Stimulus
 from coordinator.mission.executor import Executor
 from coordinator.net import Marking
@@ -18,10 +18,13 @@ from services.comm.caller import Caller
 from services.comm.directory import Directory, DirectoryError
 from services.comm.messages import Call, Outcome
 from services.comm.notice import Ended, Notice, PeerBack, PeerLost, Progress
+from services.comm.verdicts import VerdictSaid
 
 SERVICE_DEADLINE = 20.0
 TOLD_ERRORS = 6
 """How many of the last runs that ended in ERROR the result of a mission run tells that ended so itself."""
+VERDICTS = "verdicts"
+"""Key of a score under which it judges runs that ended provisionally: {run: {status, cause, text}}."""
 
 
 class Stage(Enum):
@@ -49,21 +52,37 @@ class Cycle:
     number: int
     begun: float
     ended: float | None = None
-    status: Status = Status.SUCCESS
-    cause: str = ""
-    text: str = ""
+    ends: dict[str, tuple[Status, str, str]] = field(default_factory=dict)
+    """By run, in the order in which they ended: status, cause and text."""
 
-    def count(self, record: RunRecorded) -> None:
-        """Take a run into account: the worst status counts, the first cause of it is kept."""
+    def count(self, run: str, status: Status | None, cause: str, text: str) -> None:
+        """Take a run into account, or the verdict on one that was before."""
+        if status is not None:
+            self.ends[run] = (status, cause, text)
+
+    @property
+    def worst(self) -> tuple[Status, str, str]:
+        """The worst status of its runs; of several that are as bad the first, with its cause and text."""
         rank = {Status.SUCCESS: 0, Status.FAILURE: 1, Status.ERROR: 2}
-        if record.status is not None and rank[record.status] > rank[self.status]:
-            self.status, self.cause, self.text = record.status, record.cause, record.text
+        worst = max(self.ends.values(), key=lambda end: rank[end[0]], default=None)
+        return (Status.SUCCESS, "", "") if worst is None or worst[0] is Status.SUCCESS else worst
+
+    @property
+    def status(self) -> Status:
+        """The worst status of its runs."""
+        return self.worst[0]
+
+    @property
+    def cause(self) -> str:
+        """Why it was that."""
+        return self.worst[1]
 
     def plain(self, now: float) -> dict[str, Any]:
         """Plain data; times as ages, since only durations cross the wire (s)."""
         ended = now if self.ended is None else self.ended
         ages = {"begun_ago": now - self.begun, "ended_ago": now - ended}
-        return {"n": self.number, **ages, "status": self.status.value, "cause": self.cause, "text": self.text}
+        status, cause, text = self.worst
+        return {"n": self.number, **ages, "status": status.value, "cause": cause, "text": text}
 
 
 @dataclass
@@ -85,7 +104,9 @@ class Tally:
         elif isinstance(instruction, RunRecorded):
             self.runs.append(instruction)
             if self.cycles:
-                self.cycles[-1].count(instruction)
+                self.cycles[-1].count(instruction.run, instruction.status, instruction.cause, instruction.text)
+        elif isinstance(instruction, Corrected):
+            self._correct(instruction)
         elif isinstance(instruction, StartRun):
             self.chosen[instruction.run] = instruction.action
         elif isinstance(instruction, Report) and instruction.severity is not Severity.NOTE:
@@ -114,6 +135,17 @@ class Tally:
             }
             for record in failed
         ]
+
+    def _correct(self, corrected: Corrected) -> None:
+        run, said = corrected.run, (corrected.status, corrected.cause, corrected.text)
+        for n in reversed(range(len(self.runs))):
+            if self.runs[n].run == run:
+                self.runs[n] = replace(self.runs[n], status=said[0], cause=said[1], text=said[2], deferred=False)
+                break
+        for cycle in reversed(self.cycles):
+            if run in cycle.ends:
+                cycle.count(run, *said)
+                break
 
     def _cycle(self, now: float, before: Marking, after: Marking) -> None:
         if self.runs_place is None or after[self.runs_place] >= before[self.runs_place]:
@@ -256,9 +288,24 @@ class Mission:
         self.ended = ended
         if self.tally.cycles:
             self.tally.cycles[-1].ended = ended
-        cycles = [cycle.plain(now) for cycle in self.tally.cycles]
+        cycles = [cycle.plain(now) | self._provisional(cycle) for cycle in self.tally.cycles]
         asked = self._ask(now, "score", self.executor.task.score, {"cycles": cycles})
         self.stage = Stage.SCORING if asked else Stage.OVER
+
+    def _provisional(self, cycle: Cycle) -> dict[str, Any]:
+        """What the score is told of a cycle's runs that are not judged yet; nothing if there are none."""
+        open_, call_id = self.executor.state.deferred, self.executor.dispatch.call_id
+        runs = [
+            {
+                "run": call_id(run),
+                "place": open_[run].place,
+                "action": open_[run].action,
+                "status": open_[run].status.value,
+            }
+            for run in cycle.ends
+            if run in open_
+        ]
+        return {"provisional": runs} if runs else {}
 
     def _ask(self, now: float, what: str, service: str, arguments: Mapping[str, Any]) -> bool:
         """Call a service of the task's; False when it names none, or none is placed (a real cell has no referee)."""
@@ -282,9 +329,11 @@ class Mission:
             store.sync()
             self._begin(now)
         elif self.stage is Stage.SCORING:
-            store.stage(SCORED, outcome.values)
+            score = {key: value for key, value in outcome.values.items() if key != VERDICTS}
+            self.executor.stimulate(now, *map(self.executor.verdict, _verdicts(outcome.values.get(VERDICTS, {}))))
+            store.stage(SCORED, score)
             store.sync()
-            self.score, self.stage = outcome.values, Stage.OVER
+            self.score, self.stage = score, Stage.OVER
 
     def _note_links(self, node: str, notices: Sequence[Notice]) -> None:
         for notice in notices:
@@ -293,3 +342,12 @@ class Mission:
             elif isinstance(notice, PeerBack):
                 self.lost.pop(node, None)
                 self.executor.store.node(node, notice.boot)
+
+
+def _verdicts(said: Any) -> list[VerdictSaid]:
+    """What a score says of runs. Raises MissionError when it is not {run: {status, cause, text}}."""
+    try:
+        return [VerdictSaid.of_data({**verdict, "run": run}) for run, verdict in said.items()]
+    except (AttributeError, TypeError, ValueError) as fault:
+        text = f"score: {VERDICTS}: {fault}; give {{run: {{status, cause, text}}}} with the runs' ids"
+        raise MissionError(text) from fault

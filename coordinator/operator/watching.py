@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from math import isfinite
 from typing import Any, Protocol
 
-from coordinator.engine import Instruction, RunRecorded, State, Stimulus
+from coordinator.engine import Corrected, Instruction, RunRecorded, State, Stimulus
 from coordinator.hmi.feed import Feed
 from coordinator.mission.mission import Mission
 from coordinator.mission.partners import FirstAlternative
@@ -160,14 +160,20 @@ class Watching:
         """Show what was learned of a run's end."""
         if isinstance(instruction, RunRecorded):
             self._learned(instruction.primitive_task)
+        elif isinstance(instruction, Corrected):  # no trial more, so nothing is added to the curves
+            self._shown(self._mission.executor.task.primitive_task_of(instruction.place).name)
 
-    def _learned(self, name: str) -> None:
-        task = self._mission.executor.task
+    def _shown(self, name: str) -> list[dict[str, Any]]:
+        """Show what is known of the alternatives of a primitive task now."""
         if not self._selector.figures(name):
-            return
-        shown = shown_alternatives(task, self._selector, name)
+            return []
+        shown = shown_alternatives(self._mission.executor.task, self._selector, name)
         known = self._feed.state["selectors"].get(name, {})
         self._feed.emit("selector", name=name, selector={**known, "alternatives": shown})
+        return shown
+
+    def _learned(self, name: str) -> None:
+        shown = self._shown(name)
         if len(shown) > 1:
             for figure, word in IN_CURVES.items():
                 self._curve(name, figure, word, {a["action"]: a[figure] for a in shown if figure in a})

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from xml.sax.saxutils import quoteattr
 
-from coordinator.engine import Fired, RunRecorded, StartRun, to_plain
+from coordinator.engine import Corrected, Fired, RunRecorded, StartRun, to_plain
 from coordinator.record.journal import Journal
 from coordinator.record.recording import Step
 
@@ -59,6 +59,14 @@ def _xes_event(instruction: object) -> str | None:
         names = {"concept:name": instruction.place, "lifecycle:transition": "complete", "kind": "run"}
         status = "none" if instruction.status is None else instruction.status.value
         reason = {"status": status, "cause": instruction.cause}
+        return _strings({**names, "concept:instance": instruction.run, "org:resource": instruction.action, **reason})
+    if isinstance(instruction, Corrected):
+        names = {
+            "concept:name": f"verdict on {instruction.place}",
+            "lifecycle:transition": "complete",
+            "kind": "verdict",
+        }
+        reason = {"status": instruction.status.value, "cause": instruction.cause}
         return _strings({**names, "concept:instance": instruction.run, "org:resource": instruction.action, **reason})
     return None
 

@@ -13,7 +13,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
-from coordinator.engine import Fired, Instruction, Report, RunRecorded, StartRun
+from coordinator.engine import Corrected, Fired, Instruction, Report, RunRecorded, StartRun
 from coordinator.net import Net
 from coordinator.record.journal import Journal
 from coordinator.record.recording import Step
@@ -27,7 +27,7 @@ CHANNELS: Final[Mapping[str, Mapping[str, Any]]] = {
         "run": _TEXT,
         "place": _TEXT,
         "action": _TEXT,
-        "phase": {"type": "string", "enum": ["started", "ended"]},
+        "phase": {"type": "string", "enum": ["started", "ended", "judged"]},
         "status": _TEXT,
         "cause": _TEXT,
         "text": _TEXT,
@@ -85,6 +85,9 @@ def _told(one: Instruction) -> tuple[str, dict[str, Any]] | None:
         how = {"status": status, "cause": one.cause, "text": one.text, "executed": one.executed.value}
         which = {"run": one.run, "place": one.place, "action": one.action, "phase": "ended"}
         return "run", {**which, **how, "seconds": one.seconds}
+    if isinstance(one, Corrected):
+        which = {"run": one.run, "place": one.place, "action": one.action, "phase": "judged"}
+        return "run", {**which, "status": one.status.value, "cause": one.cause, "text": one.text}
     if isinstance(one, Report):
         return "report", {"severity": one.severity.value, "key": one.key, "text": one.text, "of": one.of}
     return None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from coordinator.engine import State
-from coordinator.engine.instructions import Fired, Instruction, Report, RunRecorded, StartRun
+from coordinator.engine.instructions import Corrected, Fired, Instruction, Report, RunRecorded, StartRun
 from coordinator.engine.stimuli import Stimulus
 from coordinator.task import Status
 from services.comm.notice import Progress
@@ -56,6 +56,10 @@ class Timeline:
             self.bars[instruction.run] = replace(
                 bar, ended=time, status=instruction.status, cause=instruction.cause, text=instruction.text
             )
+        elif isinstance(instruction, Corrected) and instruction.run in self.bars:
+            judged = (instruction.status, instruction.cause, instruction.text)
+            bar = self.bars[instruction.run]
+            self.bars[instruction.run] = replace(bar, status=judged[0], cause=judged[1], text=judged[2] or bar.text)
         elif isinstance(instruction, Fired):
             self.firings.append(
                 Firing(time, instruction.number, instruction.transition, instruction.cause, instruction.after)

@@ -271,6 +271,7 @@ class Callee:
         executed: Executed = Executed.YES,
         seconds: float | None = None,
         cpu_seconds: float = 0.0,
+        deferred: bool = False,
     ) -> Outcome:
         """A run has ended; gives the outcome its caller is told. `seconds` is taken from the clock when left out.
 
@@ -287,7 +288,7 @@ class Callee:
         else:
             if run.stopping and cause == "cancelled":
                 cause, text = run.reason, text or run.call.service
-            outcome = Outcome(id, status, values or {}, cause, text, executed, took, cpu_seconds)
+            outcome = Outcome(id, status, values or {}, cause, text, executed, took, cpu_seconds, deferred)
         outcome = _sendable(outcome)
         self._end(now, run.peer, outcome)
         return outcome
@@ -392,5 +393,5 @@ def _sendable(outcome: Outcome) -> Outcome:
         values = plain(outcome.values, "values") if outcome.values else outcome.values
     except NotPlainError as fault:
         text = f"what it returned cannot be sent: {fault}"
-        return replace(outcome, status=ERROR, values={}, cause="bad_result", text=text)
+        return replace(outcome, status=ERROR, values={}, cause="bad_result", text=text, deferred=False)
     return replace(outcome, status=str(outcome.status), values=values)

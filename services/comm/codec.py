@@ -51,6 +51,8 @@ MAX_CONTAINERS = 100_000
 """Most arrays and maps in one message: one byte each on the wire, some 70 in memory."""
 UNCOUNTED = 64 * KIB
 """Bodies up to so many bytes are read without counting their arrays and maps."""
+_SELDOM = frozenset((m.Outcome.KIND,))
+"""Kinds whose last field, a bool, is left out when it is false: a peer that does not know it yet is not bothered with it."""
 _NUMBERS = frozenset((float, int))
 _TICK = Tick.KIND
 _ARRAY, _MESSAGE = 1, 2
@@ -212,7 +214,8 @@ def encode(message: Message) -> bytes:
         elif kind == Tick.KIND:
             body = msgpack.packb([kind, *_tick_out(message)], default=_extension)
         else:
-            body = _pack([kind, *_SPECS[kind].read(message)])
+            row = [kind, *_SPECS[kind].read(message)]
+            body = _pack(row[:-1] if kind in _SELDOM and not row[-1] else row)
     except (TypeError, ValueError, OverflowError) as fault:
         raise ProtocolError("unencodable", f"{type(message).__name__}: {fault}") from None
     if len(body) > LIMITS[kind]:

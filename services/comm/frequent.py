@@ -69,7 +69,8 @@ def _call_row(call: Any) -> tuple[Any, ...]:
 
 
 def _outcome_row(end: Any) -> tuple[Any, ...]:
-    return (7, end.id, end.status, end.values, end.cause, end.text, end.executed, end.seconds, end.cpu_seconds)
+    row = (7, end.id, end.status, end.values, end.cause, end.text, end.executed, end.seconds, end.cpu_seconds)
+    return (*row, True) if end.deferred else row  # seldom; a peer that does not know the field never sees it otherwise
 
 
 WRITERS: Mapping[int, Callable[[Any], tuple[Any, ...]]] = {Call.KIND: _call_row, Outcome.KIND: _outcome_row}

@@ -120,6 +120,8 @@ class Outcome:
     seconds: float = 0.0
     """How long the run took on the node's clock."""
     cpu_seconds: float = 0.0
+    deferred: bool = False
+    """The status is provisional: a later verdict may correct it for the estimates. Left out on the wire when false."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -226,6 +226,16 @@ def test_the_quick_way_writes_what_the_table_writes(message: m.Message) -> None:
     assert decode(by_table) == message
 
 
+def test_a_provisional_result_has_one_field_more_and_any_other_none() -> None:
+    """So a side that does not know the field yet takes every result that is sure, byte for byte as before."""
+    sure, open_ = (m.Outcome("c1", "success", seconds=1.0, deferred=deferred) for deferred in (False, True))
+    assert encode(open_) == b"\x9a" + encode(sure)[1:] + b"\xc3" and encode(sure)[0] == 0x99
+    assert (decode(encode(sure)), decode(encode(open_))) == (sure, open_)
+    assert decode(b"\x9a" + encode(sure)[1:] + b"\xc2") == sure, "written out by whoever does"
+    with pytest.raises(ProtocolError, match="deferred is a int, not a bool"):
+        decode(b"\x9a" + encode(sure)[1:] + b"\x01")
+
+
 def _told(body: bytes, quick: bool = True) -> str:
     with pytest.MonkeyPatch.context() as patch:
         if not quick:

@@ -309,6 +309,35 @@ def test_deferred_verdict_corrects_once_and_moves_nothing(play: Plays) -> None:
     assert p.marked == {"done": 1} and p.reports == ["no_verdict_due"]
 
 
+def test_a_verdict_may_overtake_the_end_of_its_run(play: Plays) -> None:
+    """Two nodes, two links: the judge's word may come first. It is kept until the run ends, and counts once."""
+    p = play("a!=1 done broken", BRANCHES)
+    p(Verdict("a#1", FAIL, "slipped", "seen from above"), Verdict("a#1", OK))
+    assert p.of(Corrected) == [] and p.reports == ["no_verdict_due"]
+    p(RunEnded("a#1", OK, deferred=True), Verdict("a#1", OK))
+    (corrected,) = p.of(Corrected)
+    assert (corrected.was, corrected.status, corrected.cause, corrected.text) == (
+        OK,
+        FAIL,
+        "slipped",
+        "seen from above",
+    )
+    assert p.marked == {"done": 1} and p.reports == ["no_verdict_due"] * 2
+
+
+def test_a_verdict_on_a_run_that_was_sure_changes_nothing(play: Plays) -> None:
+    p = play("a!=1 done broken", BRANCHES)
+    p(Verdict("a#1", FAIL), RunEnded("a#1", OK), Verdict("a#1", FAIL), Verdict("b#7", OK))
+    assert p.of(Corrected) == [] and p.reports == ["no_verdict_due"] * 3
+
+
+def test_a_verdict_that_agrees_keeps_the_cause(play: Plays) -> None:
+    p = play("a!=1 done broken", BRANCHES)
+    p(RunEnded("a#1", FAIL, "loose", deferred=True), Verdict("a#1", FAIL))
+    (corrected,) = p.of(Corrected)
+    assert (corrected.was, corrected.status, corrected.cause) == (FAIL, FAIL, "loose")
+
+
 def test_records_for_the_estimates(play: Plays) -> None:
     p = play("a!=1 done broken", BRANCHES)
     p(RunEnded("a#1", ERR, "no_node", "unreachable", Executed.NO, seconds=0.1))

@@ -46,6 +46,8 @@ def _fields(draw: st.DrawFn, kind: str, number: int, going: list[str]) -> dict[s
         return {"id": draw(st.sampled_from(going)), draw(st.sampled_from(["progress", "state"])): draw(SMALL)}
     if kind == "run_ended":
         return {"id": going.pop(), "status": "success", "ended": number}
+    if kind == "run_judged":
+        return {"id": f"r{draw(st.integers(1, number))}", "status": draw(st.sampled_from(["success", "failure"]))}
     if kind == "marking":
         return {"marking": draw(st.dictionaries(NAMES, SMALL))}
     if kind == "mission":
@@ -95,6 +97,25 @@ def test_a_snapshot_is_out_of_reach_of_later_changes(made: list[dict[str, Any]])
         feed.emit(**{k: v for k, v in change.items() if k != "sequence"})
     assert snapshot == kept
     assert feed.state["sequence"] == len(made)
+
+
+def test_a_verdict_changes_the_run_that_had_ended_and_no_other() -> None:
+    """What the page shows of a provisional run is what it came to; one that has left the list stays away."""
+    state = empty_state()
+    for change in (
+        {"kind": "run_started", "run": {"id": "a#1", "place": "a"}},
+        {"kind": "run_started", "run": {"id": "a#2", "place": "a"}},
+        {"kind": "run_ended", "id": "a#1", "status": "success", "ended": 1.0, "reason": {}},
+        {"kind": "run_ended", "id": "a#2", "status": "success", "ended": 2.0, "reason": {}},
+        {"kind": "run_judged", "id": "a#1", "status": "failure", "reason": {"code": "crooked"}},
+        {"kind": "run_judged", "id": "a#9", "status": "failure", "reason": {}},
+    ):
+        apply(state, change)
+    assert [(run["id"], run["status"], run["ended"]) for run in state["ended"]] == [
+        ("a#1", "failure", 1.0),
+        ("a#2", "success", 2.0),
+    ]
+    assert state["ended"][0]["reason"] == {"code": "crooked"} and not state["runs"]
 
 
 def test_what_waits_for_a_slow_client_is_bounded() -> None:

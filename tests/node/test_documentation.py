@@ -25,7 +25,7 @@ PAGE = ROOT / "docs" / "actions.md"
 def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with all files of the page."""
     blocks = re.findall(r"```(?:python|toml)\n# file: (\S+)\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    assert len(blocks) == 5
+    assert len(blocks) == 6
     for name, text in blocks:
         path = tmp_path / name
         path.parent.mkdir(exist_ok=True)
@@ -44,7 +44,7 @@ def test_the_pages_own_test_passes(files: Path) -> None:
         text=True,
     )
     assert ended.returncode == 0, ended.stdout + ended.stderr
-    assert "3 passed" in ended.stdout
+    assert "4 passed" in ended.stdout
 
 
 @pytest.mark.parametrize("mocked", [False, True])

@@ -10,14 +10,21 @@ import pytest
 from services.comm.directory import ServiceEntry
 from services.comm.messages import Call, Executed
 from services.inline_service import inline_service
+from services.runs import Judged
 
 EVENTS: list[tuple[str, str, Mapping[str, Any]]] = []
+VERDICTS: list[tuple[str, Judged]] = []
 
 
 def _call(function: str, **arguments: Any) -> Any:
     EVENTS.clear()
+    VERDICTS.clear()
     entry = ServiceEntry("it", "here", f"toy_cell.actions:{function}")
-    answer = inline_service(entry, lambda service, name, data: EVENTS.append((service, name, data)))
+    answer = inline_service(
+        entry,
+        lambda service, name, data: EVENTS.append((service, name, data)),
+        lambda service, judged: VERDICTS.append((service, judged)),
+    )
     return answer(1.5, Call("c1", "it", arguments))
 
 
@@ -26,6 +33,13 @@ def test_its_values_are_plain_and_its_events_are_told() -> None:
     assert (outcome.status, outcome.values, outcome.executed) == ("success", {"numbers": [2.0, 4.0]}, Executed.YES)
     assert type(outcome.values["numbers"]) is list, "as its caller would see it over the wire"
     assert EVENTS == [("it", "doubled", {"count": 2})]
+
+
+def test_its_verdicts_are_told() -> None:
+    """A service may judge as an action may: it is on nobody's device, and sees what all of them did."""
+    assert _call("judge", run="m/pick#1").status == "success"
+    assert [("it", Judged("c1", "m/pick#1", "failure", "crooked"))] == VERDICTS
+    assert _call("judge", run="pick").cause == "exception" and VERDICTS == []
 
 
 @pytest.mark.parametrize(

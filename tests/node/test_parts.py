@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from services import memory as memory_module
-from services.action import Context, Result, Status, failure, success
+from services.action import Context, Result, Status, failure, provisional, success
 from services.device_process import LINKED, DeviceLoop
 from services.memory import Memory, event_name
 from services.outlets import Outlets
@@ -394,6 +394,30 @@ def test_a_rehearsal_tells_all_that_an_action_did() -> None:
     assert played.result.values == {"sum": 5, "unknown": "unknown_service"} and 0.5 < played.seconds < 0.52
     assert [name for _, name, _ in played.calls] == ["add", "memory.put", "memory.get", "nobody"]
     assert len(played.published) == 26 and played.progress == [(0.0, 0.5)] and len(played.events) == 1
+
+
+def test_a_rehearsal_shows_what_is_provisional_and_what_was_judged() -> None:
+    async def act(ctx: Context, run: str) -> Result:
+        await ctx.sleep(0.1)
+        ctx.verdict(run, Status.FAILURE, "crooked")
+        with pytest.raises(ValueError, match="give what its own context gave"):
+            ctx.verdict("pick#1", Status.FAILURE)
+        with pytest.raises(ValueError, match="good"):
+            ctx.verdict(run, "good")  # type: ignore[arg-type]
+        return provisional(failure("loose", "may hold", force=1.0))
+
+    played = rehearse(act, run="m/pick#1")
+    assert played.result == Result(Status.FAILURE, {"force": 1.0}, "loose", "may hold", deferred=True)
+    assert [(run, status, cause) for _, run, status, cause in played.verdicts] == [("m/pick#1", "failure", "crooked")]
+
+
+def test_a_script_may_be_provisional(tmp_path: Path) -> None:
+    file = tmp_path / "script.toml"
+    file.write_text("schema = 1\n[actions.one]\ndeferred = true\n")
+    assert rehearse(load(file)["one"]).result.deferred
+    file.write_text('schema = 1\n[actions.one]\ndeferred = "later"\n')
+    with pytest.raises(ScriptError, match=r"actions\.one: deferred is 'later'; write true"):
+        load(file)
 
 
 def test_a_rehearsal_has_a_limit() -> None:

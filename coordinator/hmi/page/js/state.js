@@ -42,6 +42,9 @@ const RULES = {
     delete state.runs[c.id];
     append(state, "ended", { ...run, ...pick(c, ["status", "ended", "reason", "counts"]) }, ENDED_KEPT);
   },
+  run_judged(state, c) {
+    state.ended = state.ended.map((run) => (run.id === c.id ? { ...run, ...pick(c, ["status", "reason"]) } : run));
+  },
   setpoint(state, c) {
     const known = state.setpoints[c.stream] ?? { samples: [] };
     const samples = [...known.samples, ...(c.samples ?? [])].slice(-SAMPLES_KEPT);
@@ -53,7 +56,7 @@ const RULES = {
 /** Which part of the state a kind of change alters. */
 export const PART = {
   mission: "mission", marking: "marking", fired: "firings", run_started: "runs", run_progress: "runs",
-  run_ended: "runs", setpoint: "setpoints", notice: "notices",
+  run_ended: "runs", run_judged: "runs", setpoint: "setpoints", notice: "notices",
   ...Object.fromEntries(Object.entries(NAMED).map(([kind, [table]]) => [kind, table])),
   ...Object.fromEntries([...WHOLE].map((kind) => [kind, kind])),
 };

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 
-from services.action import Cancelled, Context, Result, error, failure, success
+from services.action import Cancelled, Context, Result, Status, error, failure, success
 
 
 def add(ctx: Context, *, a: int, b: int = 1) -> Result:
@@ -165,3 +165,9 @@ def double(ctx: Context, *, numbers: tuple[float, ...]) -> Result:
 def broken(ctx: Context) -> Result:
     """Fails as programs do."""
     raise ZeroDivisionError("nothing is divided by nothing")
+
+
+def judge(ctx: Context, *, run: str) -> Result:
+    """Say what an earlier run really came to."""
+    ctx.verdict(run, Status.FAILURE, "crooked")
+    return success()

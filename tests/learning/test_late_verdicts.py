@@ -1,0 +1,133 @@
+"""Verdicts and the estimates file: R is corrected once, wherever the mission run was interrupted and wherever the file went."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from coordinator.experience.estimates_file import EstimatesFile
+from coordinator.experience.learning_session import LearningSession, LearningSetting, session_of
+from coordinator.launch import Setting, lockstep_cell
+from coordinator.learning.records import Correction, End, Record, of_plain, to_plain
+from coordinator.task import Task
+from tests.mission.judged_parts import LEARNED, PARTS, directory, learned, sorting
+
+SELECTOR = "round_robin"
+
+
+@pytest.fixture(scope="module")
+def task() -> Task:
+    """Parts that are picked provisionally, and judged later."""
+    return sorting()
+
+
+def whole(task: Task, path: Path) -> LearningSession:
+    """A mission run that learned, and was not saved."""
+    session = LearningSession(task, LearningSetting(path, SELECTOR), seed=1)
+    cell, party = lockstep_cell(directory(), Setting(task, runs=PARTS, seed=1, selector=session.selector))
+    assert cell.run(lambda: party.over, 100_000)
+    return session
+
+
+def shown(session: LearningSession, records: Sequence[Record]) -> LearningSession:
+    """The session after these records, as a resume shows them to it."""
+    for record in records:
+        session.selector.records.append(record)
+        session.learning.apply(record)
+    return session
+
+
+def taken_up(task: Task, session: LearningSession, records: Sequence[Record]) -> LearningSession:
+    """Another process goes on with a session, and has come as far as these records."""
+    header = {"seed": 1, "learning": json.loads(json.dumps(session.beginning()))}
+    again = session_of(task, header)
+    assert again is not None
+    return shown(again, records)
+
+
+def kept(path: Path) -> Mapping[str, tuple[dict[Any, int], int]]:
+    """By action: what the file says of its runs, and how many were corrected."""
+    tallies = EstimatesFile(path).read().estimates.tallies
+    return {key.action: (dict(t.counts), t.corrected) for key, t in tallies.items() if key.primitive_task == "pick"}
+
+
+TRUE = {action: (counts, corrected) for action, (counts, corrected, _) in LEARNED.items()}
+
+
+def test_wherever_it_was_interrupted_each_verdict_counts_once(task: Task, tmp_path: Path) -> None:
+    """At any record: with the run and its verdict on one side, or the run counted and saved before its verdict came."""
+    one = whole(task, tmp_path / "none.db")
+    records = one.selector.records
+    assert sum(isinstance(r, Correction) for r in records) == 5
+    assert learned(one.selector) == LEARNED
+    for done in range(1, len(records) + 1):
+        path = tmp_path / f"{done}.db"
+        first = LearningSession(task, LearningSetting(path, SELECTOR), seed=1)
+        taken_up(task, first, records[:done]).save(interrupted=True)
+        resumed = taken_up(task, first, records)
+        resumed.save()
+        assert kept(path) == TRUE, f"interrupted after {done} of {len(records)} records"
+        states = EstimatesFile(path).read().states(SELECTOR)
+        assert states == resumed.learning.state() == one.learning.state()
+
+
+def split(task: Task, path: Path, between: Callable[[], None]) -> None:
+    """All runs are counted and saved, something happens to the file, then the score's verdict on the third pick comes."""
+    records = whole(task, path.with_name("none.db")).selector.records
+    last = max(n for n, r in enumerate(records) if isinstance(r, Correction))
+    first = LearningSession(task, LearningSetting(path, SELECTOR), seed=1)
+    taken_up(task, first, records[:last]).save(interrupted=True)
+    between()
+    taken_up(task, first, records).save()
+
+
+def test_merged_before_and_after_it_counts_once(task: Task, tmp_path: Path) -> None:
+    """Another machine has heard of the run before its verdict came, and hears of that later, as often as one likes."""
+    path, other = tmp_path / "here.db", tmp_path / "there.db"
+    split(task, path, lambda: EstimatesFile(other).merge(path))
+    assert kept(other)["pick_left"] == ({("failure", "crooked"): 1, ("success", ""): 2}, 1), "provisional until then"
+    for _ in range(2):
+        EstimatesFile(other).merge(path)
+        EstimatesFile(path).merge(other)
+    assert kept(path) == kept(other) == TRUE
+
+
+def test_what_was_forgotten_or_copied_meanwhile_is_left_alone(task: Task, tmp_path: Path) -> None:
+    """The runs are not this file's own any more: no run of somebody else's is corrected in their place."""
+    path = tmp_path / "reset.db"
+    split(task, path, EstimatesFile(path).reset)
+    assert kept(path) == {}
+    path, aside = tmp_path / "copied.db", tmp_path / "aside.db"
+
+    def copy() -> None:
+        shutil.copy(path, aside)
+        aside.replace(path)
+
+    split(task, path, copy)
+    assert kept(path)["pick_left"][1] == 1, "as the copied file says"
+    assert sum(kept(path)["pick_left"][0].values()) == 3
+
+
+def test_a_file_reset_and_learned_anew_keeps_its_new_runs(task: Task, tmp_path: Path) -> None:
+    """The new runs look like the forgotten one, and are not taken for it."""
+    path = tmp_path / "learned.db"
+
+    def reset_and_learn() -> None:
+        EstimatesFile(path).reset()
+        whole(task, path).save()
+
+    split(task, path, reset_and_learn)
+    assert kept(path) == TRUE
+
+
+def test_records_of_verdicts_are_plain_data_and_back(task: Task, tmp_path: Path) -> None:
+    records = whole(task, tmp_path / "none.db").selector.records
+    judged = [r for r in records if isinstance(r, Correction)]
+    assert [of_plain(json.loads(json.dumps(to_plain(r)))) for r in judged] == judged
+    ends = [r for r in records if isinstance(r, End) and r.primitive_task == "pick"]
+    assert {id(r.was) for r in judged} <= {id(r.outcome) for r in ends}

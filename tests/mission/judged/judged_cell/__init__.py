@@ -1,0 +1,1 @@
+"""The judged cell's own package, as a laboratory would have one."""
