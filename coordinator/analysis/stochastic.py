@@ -48,7 +48,7 @@ class Measured:
 
 
 def is_cause(transition: Transition) -> bool:
-    """Whether a preemption by this transition is a cause of its own by which a run ends, with a time of its own since the run began.
+    """Whether a preemption by this transition is a cause of its own by which a run ends, at a time of its own since it began.
 
     So it is where an event or a timer takes one run and looks at no other one. A transition that fires as soon as its arcs allow
     it (another run has ended, a token has come) only cuts the run off: the net says when, and the run would have ended otherwise.

@@ -44,9 +44,7 @@ class Vocabulary:
         flat = task.flat
         taking = [t for t in flat.transitions.values() if t.events or t.after is not None or reads_variables(t)]
         cutting = [
-            t.name
-            for t in flat.transitions.values()
-            if any(a.end is End.PREEMPT for a in t.inputs) and not is_cause(t)
+            t.name for t in flat.transitions.values() if any(a.end is End.PREEMPT for a in t.inputs) and not is_cause(t)
         ]
         actions = dict.fromkeys(a for p in flat.primitive_tasks.values() for a in p.alternatives)
         places = tuple(p.name for p in flat.places.values() if p.kind is Kind.ACTION)

@@ -47,7 +47,8 @@ class Law:
     @property
     def beyond(self) -> np.ndarray:
         """Members that stand for what comes after the longest run that was seen: their own ends are not known."""
-        return self.outcome == NONE
+        found: np.ndarray = self.outcome == NONE
+        return found
 
     @property
     def rate(self) -> float:

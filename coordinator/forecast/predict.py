@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from coordinator.forecast.choices import choice_counts, choices_of
 from coordinator.forecast.history import Training, Values
 from coordinator.forecast.laws import Laws, dependences
 from coordinator.forecast.play import Choices, Play, Played
-from coordinator.forecast.residual import doubts, measured, residuals, routing
+from coordinator.forecast.residual import doubts, residuals, routing
 from coordinator.forecast.sampling import Drawer
 from coordinator.forecast.shares import predictive_interval, share_weight
 from coordinator.forecast.structure import SUCCESS, Structure
@@ -51,16 +52,6 @@ def figures(played: Played) -> dict[str, float]:
     }
 
 
-def choices_of(training: Training) -> dict[str, dict[str, float]]:
-    """How often each action was chosen."""
-    counts: dict[str, dict[str, int]] = {}
-    for throw in training.throws:
-        for run in throw.runs:
-            actions = counts.setdefault(training.task.primitive_task_of(run.place).name, {})
-            actions[run.action] = actions.get(run.action, 0) + 1
-    return {t: {a: n / sum(actions.values()) for a, n in actions.items()} for t, actions in counts.items()}
-
-
 def predict(training: Training, request: Request) -> dict[str, Any]:
     """Forecast further throws of a regime. Raises ValueError for a choice that was never measured."""
     structure, laws = Structure.of(training.task), Laws(training)
@@ -87,6 +78,10 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
         "residual": residual,
         "doubts": doubts(residual, whole, request.point),
         "routing": routing(training, request.choices),
+        "choice_runs": {name: sum(actions.values()) for name, actions in choice_counts(training).items()},
+        "asked": sorted(
+            name for name, chosen in request.choices.items() if dict(chosen) != choices_of(training).get(name)
+        ),
         "not_back": sum(t.completed and t.time is None for t in training.throws),
         "endless": round(whole.endless / request.point, 6),
         "assumptions": list(structure.assumptions),

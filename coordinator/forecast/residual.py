@@ -43,10 +43,10 @@ def residuals(training: Training, played: Played) -> list[dict[str, Any]]:
     }
     for place, ways in routing(training).items():
         tables[f"ways out of {place}"] = ways_table(ways, played.ways.get(place, {}))
-    rows = [{"of": name, "p": _p_value(table)} for name, table in tables.items()]
-    for row, p in zip(rows, holm([float(row["p"]) for row in rows]), strict=True):
-        row["p_holm"] = p
-    return rows
+    alone = [_p_value(table) for table in tables.values()]
+    return [
+        {"of": name, "p": p, "p_holm": together} for name, p, together in zip(tables, alone, holm(alone), strict=True)
+    ]
 
 
 def _shares(one: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from coordinator.campaign.throws import RunEntry, Throw
+from coordinator.forecast.choices import choices_of
 from coordinator.forecast.history import Training
 from coordinator.forecast.laws import Laws
 from coordinator.forecast.play import Play, Played
-from coordinator.forecast.predict import choices_of
 from coordinator.forecast.sampling import Drawer
 from coordinator.forecast.structure import Structure
 from coordinator.taskfile import loads

@@ -16,9 +16,10 @@ from coordinator.campaign.observed import estimates_of
 from coordinator.campaign.rows import Row
 from coordinator.campaign.throws import RunEntry, Throw
 from coordinator.experience.propagation import propagate, unended
+from coordinator.forecast.choices import choices_of
 from coordinator.forecast.history import NONE, Training
 from coordinator.forecast.laws import Laws, with_weights
-from coordinator.forecast.predict import Request, choices_of, figures, predict
+from coordinator.forecast.predict import Request, figures, predict
 from coordinator.forecast.residual import measured
 from coordinator.forecast.structure import Structure
 from coordinator.learning.competing import incidences
@@ -265,7 +266,11 @@ def test_causes_are_events_and_timers_that_take_one_run(more: str, how: str, cau
     ("more", "how", "why"),
     [
         (', "locate:normal"', 'event = "bell"', "transitions.rung: forecasts know an event that preempts one run"),
-        (', "locate:preempt=none"', 'event = "bell"', "transitions.rung: forecasts know an event that preempts one run"),
+        (
+            ', "locate:preempt=none"',
+            'event = "bell"',
+            "transitions.rung: forecasts know an event that preempts one run",
+        ),
         ("", 'when = "dark"', "transitions.rung: when it preempts is decided by variables alone"),
     ],
 )
@@ -295,7 +300,14 @@ out = ["idle"]
 """
     ends = (("", 1.0, "rung"), ("success", 2.0, "found"))
     throws = [
-        Throw(1, 0.0, took, True, int(taken == "found"), runs=[RunEntry("watch", "watch_a", 0.0, took, status, taken=taken)])
+        Throw(
+            1,
+            0.0,
+            took,
+            True,
+            int(taken == "found"),
+            runs=[RunEntry("watch", "watch_a", 0.0, took, status, taken=taken)],
+        )
         for status, took, taken in ends
     ] * 50
     for throw in throws:
