@@ -147,8 +147,9 @@ class Training:
         if not kept:
             raise ValueError("no throw to learn from")
         waits: dict[str, list[tuple[float, int]]] = {}
+        timers = _cutting_timers(task)
         for i, throw in enumerate(kept):
-            for name, seconds in throw.waits:
+            for name, seconds in (*throw.waits, *((t, s) for t in timers for s in _waited(t, throw))):
                 waits.setdefault(name, []).append((seconds, i))
         return cls(
             task,
@@ -167,6 +168,32 @@ def by_regime(task: Task, rows: Iterable[Row]) -> dict[str, Training]:
         if row.throw is not None:
             throws.setdefault(row.regime, []).append(row.throw)
     return {regime: Training.of(task, kept) for regime, kept in throws.items()}
+
+
+def _cutting_timers(task: Task) -> list[str]:
+    """Timers that preempt beside other runs and wait for nothing but runs: their waits follow from those that they took."""
+    return [
+        t.name
+        for t in task.flat.transitions.values()
+        if t.after is not None
+        and not t.events
+        and not is_cause(t)
+        and any(a.end is End.PREEMPT for a in t.inputs)
+        and all(a.end in (End.PREEMPT, End.NORMAL, End.ERROR) for a in t.inputs)
+    ]
+
+
+def _waited(timer: str, throw: Throw) -> list[float]:
+    """Seconds of each firing of a timer, from when the last run that it takes had begun (or ended, where it takes ended ones)."""
+    by_place: dict[str, list[RunEntry]] = {}
+    for run in throw.runs:
+        if run.taken == timer:
+            by_place.setdefault(run.place, []).append(run)
+    out = []
+    for taken in zip(*by_place.values(), strict=False):
+        fired = max(run.begun + run.took for run in taken)
+        out.append(fired - max(run.begun + (0.0 if run.cancelled else run.took) for run in taken))
+    return out
 
 
 def _runs(vocabulary: Vocabulary, throws: tuple[Throw, ...]) -> Runs:
