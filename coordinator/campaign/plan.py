@@ -131,10 +131,15 @@ def read_manifest(folder: Path) -> Plan:
     path = folder / MANIFEST
     try:
         return Plan.from_plain(json.loads(path.read_text(encoding="utf-8")))
-    except FileNotFoundError as fault:
-        raise CampaignError(f"{folder} holds no campaign: {MANIFEST} is missing") from fault
-    except (OSError, ValueError, TypeError, KeyError) as fault:
-        raise CampaignError(f"{path}: {fault}") from fault
+    except (FileNotFoundError, NotADirectoryError) as fault:
+        remedy = "give a folder that `petrobot campaign --out FOLDER` wrote"
+        raise CampaignError(f"{folder} holds no campaign: {MANIFEST} is missing; {remedy}") from fault
+    except OSError as fault:
+        raise CampaignError(f"{path}: {fault.strerror or fault}") from fault
+    except KeyError as fault:
+        raise CampaignError(f"{path}: the key {fault} is missing; was it written by `petrobot campaign`?") from fault
+    except (ValueError, TypeError, AttributeError) as fault:
+        raise CampaignError(f"{path}: {fault}; was it written by `petrobot campaign`?") from fault
 
 
 def differences(old: Plan, new: Plan) -> list[str]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
 from coordinator.cli.loading import load_directory, load_task, write_json
+from coordinator.cli.quantities import whole
 
 if TYPE_CHECKING:
     from coordinator.campaign.plan import Plan
@@ -34,15 +35,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a campaign's folder, or an estimates file without its throws",
     )
     parser.add_argument(
-        "--runs", type=int, default=1000, metavar="N", help="that will be run in each regime (%(default)s)"
+        "--runs", type=whole(), default=1000, metavar="N", help="that will be run in each regime (%(default)s)"
     )
     parser.add_argument("--regime", default="", metavar="A,B", help="only these (default: all that were measured)")
     parser.add_argument(
         "--choose", default="", metavar="TASK=ACTION,...", help="choices of the new runs (default: as measured)"
     )
     parser.add_argument("--learned", metavar="CAMPAIGN", type=Path, help="new runs take what this campaign has learned")
-    parser.add_argument("--replicates", type=int, default=400, metavar="B", help="of the bootstrap (%(default)s)")
-    parser.add_argument("--seed", type=int, default=1, metavar="S", help="of the simulation (%(default)s)")
+    parser.add_argument("--replicates", type=whole(20), default=400, metavar="B", help="of the bootstrap (%(default)s)")
+    parser.add_argument("--seed", type=whole(0), default=1, metavar="S", help="of the simulation (%(default)s)")
     parser.add_argument("--out", metavar="FILE", type=Path, help="register the forecast here; never written over")
     parser.add_argument(
         "--doubtful", action="store_true", help="register it although it does not repeat even its own training"
@@ -74,8 +75,6 @@ def _forecast(options: argparse.Namespace) -> int:
     from coordinator.forecast.registered import register, write
     from coordinator.forecast.tables import forecast_text
 
-    if options.seed < 0:
-        raise CommandError(2, f"--seed {options.seed}: give 0 or more")
     task = load_task(options.task)
     trainings, estimates, about = _trainings(task, options.estimates)
     names = [name for name in options.regime.split(",") if name] or list(trainings)
@@ -197,8 +196,6 @@ def _request(task: Task, trainings: Mapping[str, Training], regime: str, options
             known = ", ".join(primitive.alternatives if primitive else task.primitive_tasks)
             raise CommandError(2, f"{option}: {name}={action} is not known to {task.name}; choose among {known}")
         choices[name] = {action: 1.0}
-    if options.runs < 1 or options.replicates < 20:
-        raise CommandError(2, "--runs needs at least 1, --replicates at least 20")
     return Request(options.runs, choices, options.seed, options.replicates)
 
 

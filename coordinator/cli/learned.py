@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from coordinator.cli import CommandError
 from coordinator.cli.loading import write_json
 from coordinator.cli.propagated import show_task
+from coordinator.cli.quantities import number, probability
 
 if TYPE_CHECKING:
     from coordinator.experience.estimates_file import EstimatesFile, Kept
@@ -33,10 +34,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="wall, cpu, count or value:NAME (default: what the task declares and was learned by, else wall)",
     )
     parser.add_argument(
-        "--target", type=float, metavar="R", help="target reliability: which scenarios and actions meet it"
+        "--target", type=probability, metavar="R", help="target reliability: which scenarios and actions meet it"
     )
-    parser.add_argument("--budget", type=float, metavar="C", help="what reliability may be had for this cost at most")
-    parser.add_argument("--rho", type=float, metavar="W", help="weight of cost in J (default: 1 / the largest cost)")
+    parser.add_argument(
+        "--budget", type=number(above=0.0), metavar="C", help="what reliability may be had for this cost at most"
+    )
+    parser.add_argument(
+        "--rho", type=number(least=0.0), metavar="W", help="weight of cost in J (default: 1 / the largest cost)"
+    )
     parser.add_argument("--selectors", action="store_true", help="reset: forget selectors' states, keep the estimates")
     parser.add_argument("--json", metavar="FILE", help="write what is shown as JSON (- for standard output)")
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
+from coordinator.cli.quantities import probability
 
 if TYPE_CHECKING:
     import argparse
@@ -41,7 +42,7 @@ def add_learning_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--target",
-        type=_probability,
+        type=probability,
         metavar="R",
         help="choose among actions that reach this reliability (with --learn)",
     )
@@ -54,15 +55,6 @@ def add_learning_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--frozen", action="store_true", help="choose the best that was learned, and learn nothing (with --learn)"
     )
-
-
-def _probability(text: str) -> float:
-    import argparse
-
-    value = float(text)
-    if not 0 < value <= 1:
-        raise argparse.ArgumentTypeError(f"{text} is no reliability: it must be above 0 and at most 1")
-    return value
 
 
 def opened(

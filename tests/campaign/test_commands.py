@@ -230,7 +230,7 @@ def _until(condition: Callable[[], bool]) -> None:
         (["campaign", *TOY, "--choose", "look=stare"], "choose among look_quick"),
         (["campaign", *TOY, "--choose", "look"], "write NAME=VALUE"),
         (["campaign", *TOY, "--regime", "easy,easy"], "each regime once"),
-        (["campaign", *TOY, "--seed", "-1"], "0 or more"),
+        (["campaign", *TOY, "--seed", "-1"], "-1 is not a whole number of at least 0"),
         (["campaign", *TOY, "--set", "speed=1"], "no parameter 'speed'"),
         (["campaign", str(TASK)], "may not run with"),
         (["campaign", "--resume", "nowhere"], "holds no campaign"),

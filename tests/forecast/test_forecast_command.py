@@ -138,10 +138,9 @@ def test_misfits(choices: dict[str, float], more: dict[str, Any], run: dict[str,
         (None, [], "the campaign ran pair, not scan; give --estimates of scan"),
         (('"first_a", ', ""), [], "first of pair has no action first_a (first_b)"),
         (("second", "third"), [], "pair has no action place second"),
-        (("", ""), ["--seed", "-1"], "--seed -1: give 0 or more"),
         (("", ""), ["--choose", "first=first_c"], "--choose: first=first_c is not known to pair"),
     ],
-    ids=["another task", "another action", "another place", "seed", "unknown choice"],
+    ids=["another task", "another action", "another place", "unknown choice"],
 )
 def test_bad_input(
     change: tuple[str, str] | None,

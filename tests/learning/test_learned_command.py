@@ -150,7 +150,7 @@ def test_without_learn_nothing_is_read_or_changed(cell: Path) -> None:
         (["--learn", "mock.toml"], "not a database"),
         (["--learn", "learned.db", "--context", "speed"], "no parameter or variable 'speed'"),
         (["--learn", "learned.db", "--selector", "greedy"], "invalid choice"),
-        (["--learn", "learned.db", "--target", "7"], "no reliability"),
+        (["--learn", "learned.db", "--target", "7"], "--target: 7 is not a number of more than 0 and at most 1"),
     ],
 )
 def test_bad_input_is_refused(cell: Path, arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
