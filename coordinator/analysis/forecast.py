@@ -113,14 +113,20 @@ class Forecast:
 
     @property
     def _spoiling(self) -> list[int]:
-        """Transitions of the GSPN by which a run ends other than with SUCCESS."""
-        index, flat = self.chain.gspn.net.transition_index, self.view.task.flat
+        """Transitions of the GSPN by which a run ends other than with SUCCESS; one that was preempted before has not ended so."""
+        net, flat = self.chain.gspn.net, self.view.task.flat
+        index = net.transition_index
         bad = {Counts.FAILURE, Counts.ERROR}
         lost = {
             t.name for t in flat.transitions.values() if any(a.counts in bad for a in t.inputs if a.end is End.PREEMPT)
         }
-        drawn = [index[name] for name, (_, _, status) in self.view.statuses.items() if status is not Status.SUCCESS]
-        return drawn + [index[case] for case, name in self.view.origin.items() if name in lost]
+        ends = {
+            net.place_index[f"{place}.{status}"]
+            for place, _, status in self.view.statuses.values()
+            if status is not Status.SUCCESS
+        }
+        spoilt = [t for t in range(len(net.transitions)) if any(p in ends for p, _ in net.produce[t])]
+        return spoilt + [index[case] for case, name in self.view.origin.items() if name in lost]
 
     @cached_property
     def worth(self) -> tuple[Worth, ...]:

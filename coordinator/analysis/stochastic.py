@@ -47,6 +47,17 @@ class Measured:
     preempted: Mapping[tuple[str, str], Mapping[str, Estimate]] = field(default_factory=dict)
 
 
+def is_cause(transition: Transition) -> bool:
+    """Whether a preemption by this transition is a cause of its own by which a run ends, at a time of its own since it began.
+
+    So it is where an event or a timer takes one run and looks at no other one. A transition that fires as soon as its arcs allow
+    it (another run has ended, a token has come) only cuts the run off: the net says when, and the run would have ended otherwise.
+    """
+    runs = [a for a in transition.inputs if a.end is not None]
+    waits = bool(transition.events) or transition.after is not None
+    return waits and len(runs) == 1 and runs[0].end is End.PREEMPT
+
+
 class NoEstimate(ValueError):  # noqa: N818 - names what is missing
     """Neither a measurement nor a declared estimate gives a number that the stochastic view needs."""
 
@@ -145,9 +156,11 @@ class _Derivation:
             self._causes(place, alternatives)
         for action, chosen in alternatives.items():
             self._choice(place, action, chosen)
-            for status, estimate in self._estimates(place, action).items():
-                if estimate.share > 0:
-                    self._status(place, action, status, estimate, laws)
+            known = {s: e for s, e in self._estimates(place, action).items() if e.share > 0}
+            for status, estimate in known.items():
+                self._status(place, action, status, estimate, laws)
+            if not known:  # it was never seen to end by itself: it goes on until something takes it
+                self.phases[name].append(f"{name}.{action}")
         preempted = any(
             a.place == name and a.end is End.PREEMPT for t in self.task.transitions.values() for a in t.inputs
         )
@@ -163,7 +176,7 @@ class _Derivation:
         """Preemption as a cause by which a run ends: `p.by.t` waits for t to take the run, which goes on until then."""
         name = place.name
         for t in self.task.transitions.values():
-            if any(a.place == name and a.end is End.PREEMPT for a in t.inputs):
+            if is_cause(t) and any(a.place == name for a in t.inputs if a.end is not None):
                 self.by[name, t.name] = f"{name}.by.{t.name}"
                 self.places[f"{name}.by.{t.name}"] = 0
                 self.phases[name].append(f"{name}.by.{t.name}")

@@ -221,6 +221,8 @@ class ThrowLog:
             known = self._entries.get(record.run)
             if known is None:
                 return
+        if record.run in self._going:  # else a preemption has taken its token, and the place may hold a later one
+            self._since[record.place] = now
         self._ended(now, record.run)
         throw, entry = known
         values = self._values.pop(record.run, {})
@@ -231,7 +233,6 @@ class ThrowLog:
         entry.values = _numbers(values)
         cost = self._cost_of(record, values)
         entry.cost = None if cost is None else round(cost, DIGITS)
-        self._since[record.place] = now
         self._ends.setdefault(throw.k, []).append(entry)
         if _RANK[entry.status] > _RANK[throw.status]:
             throw.status, throw.cause = entry.status, entry.cause

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
-from coordinator.cli.loading import load_task, write_json
+from coordinator.cli.loading import load_directory, load_task, write_json
 from coordinator.cli.quantities import whole
 
 if TYPE_CHECKING:
     from coordinator.campaign.plan import Plan
+    from coordinator.campaign.rows import Row
     from coordinator.forecast.history import Training
     from coordinator.learning.learning import Estimates
     from coordinator.task import Task
@@ -44,6 +46,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=whole(0), default=1, metavar="S", help="of the simulation (%(default)s)")
     parser.add_argument("--out", metavar="FILE", type=Path, help="register the forecast here; never written over")
     parser.add_argument(
+        "--doubtful", action="store_true", help="register it although it does not repeat even its own training"
+    )
+    parser.add_argument(
         "--compare", nargs=2, metavar=("FORECAST", "CAMPAIGN"), type=Path, help="compare with what was measured"
     )
     parser.add_argument("--markdown", metavar="FILE", type=Path, help="write the table as Markdown")
@@ -51,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Forecast, or compare: exit code 1 when the forecast disagrees."""
+    """Forecast, or compare: exit code 1 when the forecast is doubtful or disagrees."""
     from coordinator.campaign.plan import CampaignError
     from coordinator.forecast.registered import ForecastError
 
@@ -75,14 +80,20 @@ def _forecast(options: argparse.Namespace) -> int:
     names = [name for name in options.regime.split(",") if name] or list(trainings)
     requests = {name: _request(task, trainings, name, options) for name in names}
     made = register(task, trainings, requests, about, estimates)
-    if options.out is not None:
+    doubtful = any(said["doubts"] for said in made["regimes"].values())
+    registered = options.out is not None and (options.doubtful or not doubtful)
+    if registered:
         write(options.out, made)
     if options.json:
         write_json(options.json, made)
     if options.json != "-":
         print(forecast_text(made))
-        if options.out is not None:
+        if registered:
             print(f"registered: {options.out}  sha256 {made['sha256'][:16]}")
+    if doubtful and not options.doubtful:
+        kept = "" if options.out is None else f"; {options.out} is not written, --doubtful registers it all the same"
+        print(f"petrobot forecast: DOUBTFUL, see above{kept}", file=sys.stderr)
+        return 1
     return 0
 
 
@@ -96,32 +107,94 @@ def _trainings(task: Task, path: Path) -> tuple[dict[str, Training], Estimates, 
 
     if not path.is_dir():
         known = read_estimates(path)
+        _refuse_other_names(task, path, {key.primitive_task: [key.action] for key in known.tallies})
         return trainings_of(task, known), known, {"estimates": {"file": path.name, "sha256": digest(path)}}
     plan = read_manifest(path)
-    found = by_regime(task, read_table(path / TABLE))
+    _refuse_other_task(task, plan, path)
+    rows = list(read_table(path / TABLE))
+    _refuse_other_runs(task, rows, path)
+    found = by_regime(task, rows)
     if not found:
         raise CommandError(2, f"{path}: the table holds no throw yet")
     about = {
         "estimates": {"campaign": path.name, "seed": plan.seed, "block": plan.block, "sha256": digest(path / TABLE)},
         "task_sha256": plan.digests["task"],
     }
-    return found, estimates_of(task, read_table(path / TABLE), path.name), about
+    return found, estimates_of(task, rows, path.name), about
+
+
+def _refuse_other_task(task: Task, plan: Plan, path: Path) -> None:
+    """Raises CommandError when a campaign ran a task of another name, where its file still is."""
+    from coordinator.campaign.plan import MANIFEST
+
+    if not Path(plan.task).is_file():
+        return
+    name = load_task(plan.task).name
+    if name != task.name:
+        raise CommandError(
+            2, f"{path / MANIFEST}: task: the campaign ran {name}, not {task.name}; give --estimates of {task.name}"
+        )
+
+
+def _refuse_other_runs(task: Task, rows: Iterable[Row], path: Path) -> None:
+    """Raises CommandError for runs in places or of actions that the task does not have (any more)."""
+    from coordinator.campaign.table import TABLE
+
+    actions: dict[str, dict[str, None]] = {}
+    for row in rows:
+        for run in row.throw.runs if row.throw is not None else ():
+            actions.setdefault(run.place, {})[run.action] = None
+    for place, found in actions.items():
+        known = task.flat.places.get(place)
+        if known is None or not known.task:
+            raise CommandError(
+                2,
+                f"{path / TABLE}: runs: {task.name} has no action place {place}; the task file is another one: train anew",
+            )
+        _refuse_other_actions(task, known.task, found, path / TABLE)
+
+
+def _refuse_other_actions(task: Task, primitive: str, actions: Iterable[str], source: Path) -> None:
+    offered = task.flat.primitive_tasks[primitive].alternatives
+    for action in actions:
+        if action not in offered:
+            raise CommandError(
+                2,
+                f"{source}: runs: {primitive} of {task.name} has no action {action} ({', '.join(offered)}); the task file is "
+                "another one: train anew",
+            )
+
+
+def _refuse_other_names(task: Task, path: Path, found: Mapping[str, Iterable[str]]) -> None:
+    """Raises CommandError when an estimates file says nothing about the task."""
+    if not set(found) & set(task.flat.primitive_tasks):
+        raise CommandError(
+            2,
+            f"{path}: it holds estimates of {', '.join(sorted(found))}; {task.name} has {', '.join(task.flat.primitive_tasks)}",
+        )
 
 
 def _request(task: Task, trainings: Mapping[str, Training], regime: str, options: argparse.Namespace) -> Any:
     from coordinator.campaign.policies import learned_choices
-    from coordinator.forecast.predict import Request, choices_of
+    from coordinator.forecast.choices import choices_of
+    from coordinator.forecast.predict import Request
 
     if regime not in trainings:
         raise CommandError(2, f"--regime {regime}: not measured; there are {', '.join(trainings)}")
     choices: dict[str, Mapping[str, float]] = dict(choices_of(trainings[regime]))
-    learned = learned_choices(options.learned).get(regime, {}) if options.learned is not None else {}
-    by_hand = dict(_pair(text) for text in options.choose.split(",") if text)
-    for name, action in {**learned, **by_hand}.items():
+    learned = {} if options.learned is None else learned_choices(options.learned)
+    if options.learned is not None and regime not in learned:
+        raise CommandError(
+            2,
+            f"--learned {options.learned}: nothing was learned of regime {regime or '-'}; there are {', '.join(learned)}",
+        )
+    asked = {name: (action, f"--learned {options.learned}") for name, action in learned.get(regime, {}).items()}
+    asked |= {name: (action, "--choose") for name, action in (_pair(t) for t in options.choose.split(",") if t)}
+    for name, (action, option) in asked.items():
         primitive = task.primitive_tasks.get(name)
         if primitive is None or action not in primitive.alternatives:
             known = ", ".join(primitive.alternatives if primitive else task.primitive_tasks)
-            raise CommandError(2, f"--choose {name}={action}: not known to {task.name}; choose among {known}")
+            raise CommandError(2, f"{option}: {name}={action} is not known to {task.name}; choose among {known}")
         choices[name] = {action: 1.0}
     return Request(options.runs, choices, options.seed, options.replicates)
 
@@ -157,7 +230,49 @@ def fitting(registered: Path, forecast: dict[str, Any], plan: Plan) -> Task:
         raise CommandError(
             2, f"{registered} was trained on these throws (seed {plan.seed}): run the campaign with another --seed"
         )
+    for regime, counts in _planned(plan, task).items():
+        _refuse_other_choices(registered, forecast, regime, counts)
     return task
+
+
+def _planned(plan: Plan, task: Task) -> dict[str, dict[str, dict[str, float]]]:
+    """By regime: how a campaign that learns nothing will choose; empty where its file of services is not here."""
+    from coordinator.campaign.policies import learns, policy_of
+
+    if learns(plan.selector) or not Path(plan.services).is_file():
+        return {}
+    policy = policy_of(plan, task, load_directory(Path(plan.services)))
+    out: dict[str, dict[str, dict[str, float]]] = {}
+    for block in plan.blocks:
+        for weights in policy.weights(block):
+            for name, shares in weights.items():
+                counts = out.setdefault(block.regime, {}).setdefault(name, {})
+                for action, p in shares.items():
+                    counts[action] = counts.get(action, 0.0) + p
+    return {r: {name: _certain(counts) for name, counts in chosen.items()} for r, chosen in out.items()}
+
+
+def _certain(counts: Mapping[str, float]) -> dict[str, float]:
+    """A plan's shares are known exactly, however few runs it has: they weigh as a thousand runs."""
+    whole = sum(counts.values())
+    return {action: 1000.0 * n / whole for action, n in counts.items()}
+
+
+def _refuse_other_choices(
+    registered: Path, forecast: Mapping[str, Any], regime: str, counts: Mapping[str, Mapping[str, float]]
+) -> None:
+    """Raises CommandError when a regime's runs choose otherwise than their forecast says."""
+    from coordinator.forecast.choices import in_words, misfit, remedy
+
+    said = forecast["regimes"].get(regime)
+    names = [] if said is None else misfit(said, counts)
+    if said is not None and names:
+        raise CommandError(
+            2,
+            f"{registered} is of other choices, regime {regime or '-'}: it forecasts {in_words(said['choices'], names)}; the "
+            f"campaign chooses {in_words(counts, names)}: {remedy(said['choices'], names)}, or forecast what it chooses "
+            "(petrobot forecast --choose)",
+        )
 
 
 def compared(registered: Path, folder: Path) -> dict[str, Any]:
@@ -166,12 +281,15 @@ def compared(registered: Path, folder: Path) -> dict[str, Any]:
     from coordinator.campaign.spent import began
     from coordinator.campaign.table import TABLE, read_table
     from coordinator.forecast.agreement import agreement
+    from coordinator.forecast.choices import choice_counts
     from coordinator.forecast.history import by_regime
     from coordinator.forecast.registered import read
 
     forecast, plan = read(registered), read_manifest(folder)
     task = fitting(registered, forecast, plan)
     measured = by_regime(task, read_table(folder / TABLE))
+    for regime, training in measured.items():
+        _refuse_other_choices(registered, forecast, regime, choice_counts(training))
     try:
         found = agreement(forecast, measured)
     except ValueError as fault:
@@ -183,6 +301,7 @@ def compared(registered: Path, folder: Path) -> dict[str, Any]:
         "campaign": {"folder": folder.name, "seed": plan.seed, "began_at": first},
         "registered_before": first is not None and forecast["registered_at"] <= first,
         "same_block": forecast["estimates"].get("block") in (None, plan.block),
+        "doubts": {name: said["doubts"] for name, said in forecast["regimes"].items() if said.get("doubts")},
         "same_task_file": forecast.get("task_sha256") in (None, plan.digests["task"]),
         **found,
     }

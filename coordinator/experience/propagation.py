@@ -6,21 +6,21 @@ net is a mere series, all must come to the conjunctive product R = R_1 R_2 ..., 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from math import nan, prod
+from math import log, nan, prod, sqrt
 from typing import Any
 
 from coordinator.analysis.forecast import Forecast, forecast
 from coordinator.analysis.graph import sum_by
 from coordinator.analysis.space import Limits
-from coordinator.analysis.stochastic import Measured, stochastic_view
+from coordinator.analysis.stochastic import Measured, is_cause, stochastic_view
 from coordinator.learning.competing import Incidence, incidences
 from coordinator.learning.estimate import CENSORED, Tally, merge
 from coordinator.learning.learning import Estimates
 from coordinator.learning.objective import cost_weight, objective
-from coordinator.task import End, Estimate, Kind, Status, Task
+from coordinator.task import Estimate, Kind, Status, Task
 
 Choice = Mapping[str, Mapping[str, float]]
 SHORTEST = 1e-3
@@ -36,7 +36,8 @@ def measured_from(
     """What the stochastic view needs, from estimates of one context (None: of all together).
 
     `choice` are the selector's probabilities by primitive task; None: the alternatives were chosen as often as they ran.
-    Runs of a preempted place are competing risks of their own ends and the preempting transitions; an abort is a mere cut-off.
+    Runs of a preempted place are competing risks of their own ends and the events or timers that preempt them. What preempts as
+    soon as the marking allows it (another run has ended) is no such risk but a mere cut-off, as an abort is: the net says when.
     """
     runs: dict[tuple[str, str], dict[Status, Estimate]] = {}
     preempted: dict[tuple[str, str], dict[str, Estimate]] = {}
@@ -65,10 +66,11 @@ def measured_from(
 
 
 def _preempting(task: Task, place: str) -> set[str]:
+    """Transitions by which a run in a place may end at a time of their own."""
     return {
         t.name
         for t in task.flat.transitions.values()
-        if any(a.place == place and a.end is End.PREEMPT for a in t.inputs)
+        if is_cause(t) and any(a.place == place and a.end is not None for a in t.inputs)
     }
 
 
@@ -93,7 +95,7 @@ def _ends(tally: Tally, takers: set[str]) -> tuple[dict[Status, Estimate], dict[
 
 
 def _cause(exit_: str, takers: set[str]) -> str | None:
-    """By what a run ended: a status, `by:` a transition; None: it was cut off by something that is no part of the task."""
+    """By what a run ended: a status, `by:` a transition; None: it was cut off, and would have ended otherwise."""
     status, _, transition = exit_.partition(":")
     if not transition:
         return None if status == CENSORED else status
@@ -119,10 +121,31 @@ def _exact(tally: Tally, causes: Mapping[str, str | None]) -> dict[str, _Law | I
 
 
 def _incident(tally: Tally, causes: Mapping[str, str | None]) -> dict[str, _Law | Incidence]:
-    """Some runs were cut off: Aalen-Johansen over the kept sample."""
+    """Some runs were cut off: Aalen-Johansen over the kept sample, at a constant rate beyond its longest run."""
     kept = tally.sample.kept
-    found = incidences([k.seconds for k in kept], [causes.get(k.exit) for k in kept])
-    return dict(found)
+    times, ends = [k.seconds for k in kept], [causes.get(k.exit) for k in kept]
+    left, longest = unended(times, ends)
+    found = incidences(times, ends)
+    if not 0.0 < left < 1.0 or longest <= 0.0:
+        return dict(found)
+    return {c: _with_tail(law, left, longest, longest / -log(left)) for c, law in found.items()}
+
+
+def unended(times: Sequence[float], causes: Sequence[str | None]) -> tuple[float, float]:
+    """Probability that a run has not ended by the longest time seen (Kaplan and Meier's estimate), and that time (s)."""
+    left, going = 1.0, len(times)
+    for _, cause in sorted(zip(times, causes, strict=True), key=lambda pair: (pair[0], pair[1] is None)):
+        left *= 1.0 if cause is None else 1.0 - 1.0 / going
+        going -= 1
+    return left, max(times, default=0.0)
+
+
+def _with_tail(law: Incidence, left: float, longest: float, mean: float) -> _Law:
+    """A law whose part `left` ends after `longest` s, by an exponential time of this mean (s) later."""
+    first = (1 - left) * law.mean + left * (longest + mean)
+    own = (law.cv**2 + 1) * law.mean**2
+    second = (1 - left) * own + left * (longest**2 + 2 * longest * mean + 2 * mean**2)
+    return _Law(law.share, first, sqrt(max(0.0, second - first**2)) / first)
 
 
 def _with_missing(

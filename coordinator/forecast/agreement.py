@@ -9,15 +9,16 @@ the measurement's 90 % interval lies within the margin about the forecast number
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from scipy.stats import binom, chi2_contingency, norm, t
 
 from coordinator.forecast.history import Training, Values
-from coordinator.forecast.predict import GRID, SHARES, figures, measured, routing
-from coordinator.forecast.shares import predictive_interval, share_p_value, share_weight
+from coordinator.forecast.predict import GRID, SHARES, figures
+from coordinator.forecast.residual import measured, routing, ways_table
+from coordinator.forecast.shares import holm, predictive_interval, share_p_value, share_weight
 from coordinator.learning.intervals import wilson
 
 FAMILY = ("R_goal", "P_complete", "mean", "q90")
@@ -54,16 +55,6 @@ def agreement(forecast: Mapping[str, Any], regimes: Mapping[str, Training]) -> d
         "equivalent": all(row["equivalent"] for row in family),
         "product_rejected": [row["regime"] for row in controls if row["rejected"]],
     }
-
-
-def holm(p_values: Sequence[float]) -> list[float]:
-    """Adjusted p-values: each may be compared with the level for all of them together."""
-    order = np.argsort(p_values, kind="stable")
-    out, largest = [0.0] * len(p_values), 0.0
-    for rank, i in enumerate(order):
-        largest = max(largest, min(1.0, (len(p_values) - rank) * p_values[i]))
-        out[i] = largest
-    return out
 
 
 def _row(regime: str, figure: str, said: Mapping[str, Any], training: Training) -> dict[str, Any]:
@@ -155,8 +146,7 @@ def _routing(regime: str, before: Mapping[str, Any], after: Mapping[str, Any]) -
     """For each place: chi-square test that training and new throws left it by the same ways equally often."""
     rows = []
     for place in before:
-        ways = sorted({*before[place], *after.get(place, {})})
-        table = np.array([[counts.get(place, {}).get(way, 0) for way in ways] for counts in (before, after)])
-        if len(ways) > 1 and table.sum(axis=1).min() > 0:
+        table = ways_table(before[place], after.get(place, {}))
+        if table.shape[1] > 1 and table.sum(axis=1).min() > 0:
             rows.append({"regime": regime, "place": place, "p": float(chi2_contingency(table).pvalue), "p_holm": None})
     return rows

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from coordinator.analysis.stochastic import is_cause
 from coordinator.campaign.rows import Row
 from coordinator.campaign.throws import RunEntry, Throw
-from coordinator.task import Kind, Status, Task
+from coordinator.task import End, Kind, Status, Task, Transition
 
 Codes = NDArray[np.int64]
 Values = NDArray[np.float64]
@@ -19,6 +20,8 @@ CENSORED = -1
 """Status code of a run that was preempted and counts none."""
 NONE = 0
 """Outcome and action code of a place where no run has ended in this throw yet."""
+CUT = 1
+"""Outcome code of a run that nothing is known to end: no status, and no transition took it."""
 STATUSES = tuple(Status)
 
 
@@ -29,22 +32,32 @@ class Vocabulary:
     places: tuple[str, ...]
     transitions: tuple[str, ...]
     actions: tuple[str, ...]
+    open: frozenset[str] = frozenset()
+    """Places whose ended runs the marking alone does not lead on (an event, a timer or a variable decides): there the transition
+    that took a run belongs to its outcome; elsewhere it follows from the statuses and from what else has ended."""
+    cutting: frozenset[str] = frozenset()
+    """Transitions that preempt as soon as the marking allows it: they cut runs off, whose own ends are then not known."""
 
     @classmethod
     def of(cls, task: Task) -> Vocabulary:
         """Of a task."""
         flat = task.flat
+        taking = [t for t in flat.transitions.values() if t.events or t.after is not None or reads_variables(t)]
+        cutting = [
+            t.name for t in flat.transitions.values() if any(a.end is End.PREEMPT for a in t.inputs) and not is_cause(t)
+        ]
         actions = dict.fromkeys(a for p in flat.primitive_tasks.values() for a in p.alternatives)
         places = tuple(p.name for p in flat.places.values() if p.kind is Kind.ACTION)
-        return cls(places, tuple(flat.transitions), tuple(actions))
+        undecided = frozenset(a.place for t in taking for a in t.inputs if a.end in (End.NORMAL, End.ERROR))
+        return cls(places, tuple(flat.transitions), tuple(actions), undecided, frozenset(cutting))
 
     def outcome(self, status: int, taken: int) -> int:
         """One code, above 0, for a status code and the transition that took the token (-1: none did)."""
-        return 1 + (status + 1) * (len(self.transitions) + 1) + taken + 1
+        return CUT + (status + 1) * (len(self.transitions) + 1) + taken + 1
 
     def parts(self, outcome: Codes) -> tuple[Codes, Codes]:
         """Status codes and transitions behind outcome codes above 0."""
-        status, taken = np.divmod(outcome - 1, len(self.transitions) + 1)
+        status, taken = np.divmod(outcome - CUT, len(self.transitions) + 1)
         return status - 1, taken - 1
 
 
@@ -88,7 +101,7 @@ class Runs:
     preempted: NDArray[np.bool_]
     """A transition took its token while it went on."""
     censored: NDArray[np.bool_]
-    """It was preempted and counts none."""
+    """Something cut it off: its own end is not known, only that it had lasted so long."""
     took: Values
     """s from the token's coming to its end."""
     throw: Codes
@@ -124,16 +137,19 @@ class Training:
     runs: Runs
     waits: dict[str, tuple[Values, Codes]]
     """By waiting transition: seconds of each firing, and the throw that it belongs to."""
+    whole: bool = True
+    """Its throws are those that were run; else each holds a single run or wait, and what a throw came to is not known."""
 
     @classmethod
-    def of(cls, task: Task, throws: Iterable[Throw]) -> Training:
+    def of(cls, task: Task, throws: Iterable[Throw], *, whole: bool = True) -> Training:
         """Of throws. Raises ValueError without any."""
         kept, vocabulary = tuple(throws), Vocabulary.of(task)
         if not kept:
             raise ValueError("no throw to learn from")
         waits: dict[str, list[tuple[float, int]]] = {}
+        timers = _cutting_timers(task)
         for i, throw in enumerate(kept):
-            for name, seconds in throw.waits:
+            for name, seconds in (*throw.waits, *((t, s) for t in timers for s in _waited(t, throw))):
                 waits.setdefault(name, []).append((seconds, i))
         return cls(
             task,
@@ -141,6 +157,7 @@ class Training:
             kept,
             _runs(vocabulary, kept),
             {name: (np.array([s for s, _ in w]), np.array([i for _, i in w])) for name, w in waits.items()},
+            whole,
         )
 
 
@@ -151,6 +168,32 @@ def by_regime(task: Task, rows: Iterable[Row]) -> dict[str, Training]:
         if row.throw is not None:
             throws.setdefault(row.regime, []).append(row.throw)
     return {regime: Training.of(task, kept) for regime, kept in throws.items()}
+
+
+def _cutting_timers(task: Task) -> list[str]:
+    """Timers that preempt beside other runs and wait for nothing but runs: their waits follow from those that they took."""
+    return [
+        t.name
+        for t in task.flat.transitions.values()
+        if t.after is not None
+        and not t.events
+        and not is_cause(t)
+        and any(a.end is End.PREEMPT for a in t.inputs)
+        and all(a.end in (End.PREEMPT, End.NORMAL, End.ERROR) for a in t.inputs)
+    ]
+
+
+def _waited(timer: str, throw: Throw) -> list[float]:
+    """Seconds of each firing of a timer, from when the last run that it takes had begun (or ended, where it takes ended ones)."""
+    by_place: dict[str, list[RunEntry]] = {}
+    for run in throw.runs:
+        if run.taken == timer:
+            by_place.setdefault(run.place, []).append(run)
+    out = []
+    for taken in zip(*by_place.values(), strict=False):
+        fired = max(run.begun + run.took for run in taken)
+        out.append(fired - max(run.begun + (0.0 if run.cancelled else run.took) for run in taken))
+    return out
 
 
 def _runs(vocabulary: Vocabulary, throws: tuple[Throw, ...]) -> Runs:
@@ -176,7 +219,7 @@ def _runs(vocabulary: Vocabulary, throws: tuple[Throw, ...]) -> Runs:
         np.array([actions.get(run.action, 0) for _, run in flat], np.int64),
         np.array(codes, np.int64),
         np.array([run.cancelled for _, run in flat], np.bool_),
-        np.array([not run.status for _, run in flat], np.bool_),
+        np.array([_is_cut_off(vocabulary, run) for _, run in flat], np.bool_),
         np.array([run.took for _, run in flat]),
         np.array([i for i, _ in flat], np.int64),
         np.ones(n),
@@ -193,5 +236,17 @@ def _ended_before(flat: list[tuple[int, RunEntry]], j: int, begin: int, end: int
 
 def _outcome(vocabulary: Vocabulary, run: RunEntry) -> int:
     status = STATUSES.index(Status(run.status)) if run.status else CENSORED
-    taken = vocabulary.transitions.index(run.taken) if run.taken in vocabulary.transitions else -1
-    return vocabulary.outcome(status, taken)
+    told = run.taken in vocabulary.transitions and (run.cancelled or run.place in vocabulary.open)
+    return vocabulary.outcome(status, vocabulary.transitions.index(run.taken) if told else -1)
+
+
+def _is_cut_off(vocabulary: Vocabulary, run: RunEntry) -> bool:
+    """By a transition that fires as the marking allows, or by nothing of the task (an abort, the end of the records)."""
+    if run.cancelled and run.taken in vocabulary.transitions:
+        return run.taken in vocabulary.cutting
+    return not run.status
+
+
+def reads_variables(t: Transition) -> bool:
+    """Whether its condition looks at more than the statuses of the runs that it takes."""
+    return t.when is not None and not t.when.names <= {f"{a.place}.status" for a in t.inputs if a.end is not None}

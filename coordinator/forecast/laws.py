@@ -4,12 +4,14 @@ Contexts are grown as in CHAID (G. V. Kass, Applied Statistics 29 (1980) 119-127
 significantly splits the runs, again and again, until no test rejects independence. Factors are what had ended before in the same
 throw: in each action place outcome, action and duration of the latest run, and the number of runs. First the outcome is unfolded
 so, then, for each outcome of each of these contexts, the duration: so a strong dependence among durations never hides one among
-outcomes. Within a context a duration keeps its linear trend with an earlier one. Censored runs pass their weight on to later ends
-(B. Efron's redistribution to the right, 1967): the Aalen-Johansen estimate.
+outcomes. Within a context a duration keeps its linear trend with an earlier one. Runs that were cut off are censored: the ends
+that were seen weigh what the Aalen-Johansen estimate gives them. What it leaves beyond the longest run goes on at a constant rate
+(B. W. Brown, M. Hollander and R. M. Korwar, in Reliability and Biometry, SIAM 1974), and whoever draws it is told.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -17,7 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2_contingency
 
-from coordinator.forecast.history import CENSORED, Codes, Runs, Seen, Training, Values, Vocabulary
+from coordinator.forecast.history import CENSORED, NONE, Codes, Runs, Seen, Training, Values, Vocabulary
 
 ALPHA = 0.01
 """Level at which dependence counts, over all factors of a node (Bonferroni)."""
@@ -41,6 +43,18 @@ class Law:
     throw: Codes
     trend: Trend | None = None
     """Durations only: how they go with an earlier one, within this context."""
+
+    @property
+    def beyond(self) -> np.ndarray:
+        """Members that stand for what comes after the longest run that was seen: their own ends are not known."""
+        found: np.ndarray = self.outcome == NONE
+        return found
+
+    @property
+    def rate(self) -> float:
+        """Ends a second beyond the longest run; 0 where no end was seen at all."""
+        left, longest = float(self.weight[self.beyond].sum()), float(self.took.max(initial=0.0))
+        return -math.log(left) / longest if 0.0 < left < 1.0 and longest > 0.0 else 0.0
 
 
 @dataclass(frozen=True)
@@ -129,7 +143,7 @@ class Laws:
             context.children = [self._grow(part, deepest - 1, outcomes=outcomes) for part in parts]
         elif outcomes:
             deepest = DEEPEST if deepest else 0
-            for code in np.unique(ended.outcome):
+            for code in np.unique(ended.outcome[ended.outcome != NONE]):
                 context.durations[int(code)] = self._grow(ended.of(ended.outcome == code), deepest, outcomes=False)
         return context
 
@@ -159,15 +173,18 @@ class Laws:
 
 
 def with_weights(runs: Runs) -> Runs:
-    """The runs that ended, with weights that sum to 1: censored ones give theirs to those that lasted longer (else to all)."""
-    ordered = runs.of(np.argsort(runs.took, kind="stable"))
-    weight, ended = np.full(len(runs), 1.0 / max(1, len(runs))), ~ordered.censored
-    for i in np.flatnonzero(ordered.censored):
-        later = ended & (np.arange(len(runs)) > i)
-        heirs = later if later.any() else ended
-        if heirs.any():
-            weight[heirs] += weight[i] / heirs.sum()
-    return replace(ordered, weight=weight).of(ended)
+    """The runs that ended, weighing their steps of the Aalen-Johansen estimate; the weights sum to 1.
+
+    What it leaves is shared by the runs that were cut off after the last end, which stay as members without an outcome (NONE).
+    """
+    ordered = runs.of(np.lexsort((runs.censored, runs.took)))
+    n, ended = len(runs), ~ordered.censored
+    stays = np.where(ended, 1.0 - 1.0 / (n - np.arange(n)), 1.0)
+    left = np.concatenate([[1.0], np.cumprod(stays)])
+    last = int(np.flatnonzero(ended)[-1]) + 1 if ended.any() else 0
+    beyond = np.arange(n) >= last
+    weight = np.where(beyond, left[last] / max(1, n - last), -np.diff(left))
+    return replace(ordered, weight=weight, outcome=np.where(beyond, NONE, ordered.outcome)).of(ended | beyond)
 
 
 def _law(runs: Runs, *, trend: bool) -> Law:

@@ -1,21 +1,23 @@
 """Plays throws of a task through its net, many side by side: runs end as their laws draw, the net says what follows.
 
 This is the generalised semi-Markov process of docs/forecast.md: when a token enters an action place an action is chosen, then how
-and when its run will end is drawn in one draw (competing risks: of itself with a status, or preempted by a transition);
-transitions that wait for events or timers race with their measured waits; everything else fires at once.
+and when its run will end is drawn in one draw (competing risks: of itself with a status, or preempted by an event or a timer);
+transitions that wait for events or timers race with their measured waits; everything else fires at once, also what preempts a run
+because another one has ended.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from coordinator.forecast.history import Codes, Seen, Values
+from coordinator.forecast.history import CENSORED, STATUSES, Codes, Seen, Values
 from coordinator.forecast.sampling import Drawer, Mask
 from coordinator.forecast.structure import ERROR, SUCCESS, Move, Structure
 from coordinator.net import Marking
+from coordinator.task import Counts, Status
 
 IDLE, GOING, DONE = 0, 1, 2
 LONGEST = 10_000
@@ -35,6 +37,12 @@ class Played:
     """s from the taking of the run token to the end; nan for those that did not complete."""
     endless: int = 0
     """Throws that were cut off after `longest` steps."""
+    beyond: Mapping[str, int] = field(default_factory=dict)
+    """By action place: throws in which a run went on for longer than any run that was seen, before anything took it."""
+    astray: Mapping[str, int] = field(default_factory=dict)
+    """By transition: throws in which its measured preemption came when the marking did not allow it."""
+    ways: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    """By action place: how often each transition took a token out of it."""
 
 
 class Play:
@@ -48,20 +56,20 @@ class Play:
         self._s, self._drawer = structure, drawer
         n, q = len(replicate), len(structure.vocabulary.places)
         self._choices = [self._choice(choices, name) for name in structure.vocabulary.places]
-        self._quick = [m for m in structure.moves if not m.waits and not m.preempt]
-        self._slow = [m for m in structure.moves if m.waits and not m.preempt]
+        self._quick = [m for m in structure.moves if not m.waits]
+        self._slow = [m for m in structure.moves if m.waits and not m.cause]
         self._column = np.arange(n)
         self._replicate = replicate
         self._tokens = np.repeat(structure.initial[:, None], n, axis=1)
         self._phase = np.zeros((q, n), np.int8)
         self._status, self._want = np.zeros((q, n), np.int64), np.full((q, n), -1)
+        self._came = np.zeros((q, n))
         self._preempted, self._end = np.zeros((q, n), np.bool_), np.full((q, n), np.inf)
         self._due = np.full((len(self._slow), n), np.inf)
-        self._action, self._outcome, self._took = (
-            np.zeros((q, n), np.int64),
-            np.zeros((q, n), np.int64),
-            np.zeros((q, n)),
-        )
+        self._action, self._outcome = np.zeros((q, n), np.int64), np.zeros((q, n), np.int64)
+        self._took, self._beyond = np.zeros((q, n)), np.zeros((q, n), np.bool_)
+        self._odd: dict[tuple[str, str], set[int]] = {}
+        self._ways: dict[str, dict[str, int]] = {}
         self._seen = Seen.nothing(q, n)
         self._now, self._begun = np.zeros(n), np.zeros(n)
         self._goals, self._good = np.zeros(n, np.int64), np.ones(n, np.bool_)
@@ -87,7 +95,13 @@ class Play:
                 break
             self._wait()
             self._advance()
-        return replace(self._out, endless=len(self._column))
+        return replace(
+            self._out,
+            endless=len(self._column),
+            beyond={name: len(columns) for (kind, name), columns in self._odd.items() if kind == "beyond"},
+            astray={name: len(columns) for (kind, name), columns in self._odd.items() if kind == "astray"},
+            ways=self._ways,
+        )
 
     # --- one step ----------------------------------------------------------------------------------------------------
 
@@ -95,7 +109,7 @@ class Play:
         """Fire what needs no time until nothing does."""
         for _ in range(LONGEST):
             able = np.array([self._enabled(m) for m in self._quick])
-            priority = np.array([m.priority for m in self._quick])[:, None]
+            priority = np.array([2 * m.priority - m.yields for m in self._quick])[:, None]
             highest = np.where(able, priority, np.iinfo(np.int64).min).max(axis=0)
             able &= priority == highest
             some: Mask = np.asarray(able.any(axis=0))
@@ -121,8 +135,10 @@ class Play:
             out &= (self._phase[q] == DONE) & (self._status[q] != ERROR) & self._wanted(q, m)
         for q in m.error:
             out &= (self._phase[q] == DONE) & (self._status[q] == ERROR) & self._wanted(q, m)
-        for q in (*m.going, *(preempted for preempted, _ in m.preempt)):
+        for q in m.going:
             out &= self._phase[q] == GOING
+        for q, _ in m.preempt:
+            out &= (self._phase[q] != IDLE) if m.takes_done else (self._phase[q] == GOING)
         if m.allowed is not None:
             ended = [np.clip(self._status[q], 0, None) for q in m.normal + m.error]
             out &= m.allowed[tuple(ended)]
@@ -135,8 +151,13 @@ class Play:
     def _fire(self, m: Move, columns: Codes) -> None:
         for place, weight in m.take:
             self._tokens[place, columns] -= weight
+        for q, counts in m.preempt:
+            if not m.cause:
+                self._cut(q, m, counts, columns[self._phase[q, columns] == GOING])
         for q in (*m.normal, *m.error, *(q for q, _ in m.preempt)):
             self._phase[q, columns], self._end[q, columns] = IDLE, np.inf
+            ways = self._ways.setdefault(self._s.vocabulary.places[q], {})
+            ways[m.name] = ways.get(m.name, 0) + len(columns)
         for place, weight in m.give:
             self._tokens[place, columns] += weight
         if m.takes_run:
@@ -144,6 +165,18 @@ class Play:
         self._goals[columns] += m.is_goal
         for q in m.starts:
             self._start(q, columns)
+
+    def _cut(self, q: int, m: Move, counts: Counts, columns: Codes) -> None:
+        """Runs that are taken while they go on: they count as the arc says, whatever they would have come to."""
+        status = CENSORED if counts is Counts.NONE else STATUSES.index(Status(counts.value))
+        lasted = self._now[columns] - self._came[q, columns]
+        code = np.full(len(columns), self._s.vocabulary.outcome(status, m.number))
+        self._seen.note(q, columns, code, self._action[q, columns], lasted)
+        self._good[columns] &= status <= SUCCESS
+
+    def _note_odd(self, kind: str, name: str, columns: Codes) -> None:
+        if len(columns):
+            self._odd.setdefault((kind, name), set()).update(self._column[columns].tolist())
 
     def _start(self, q: int, columns: Codes) -> None:
         """Choose an action and draw how its run will end."""
@@ -157,6 +190,7 @@ class Play:
         self._phase[q, columns], self._status[q, columns], self._want[q, columns] = GOING, status, taken
         self._preempted[q, columns], self._end[q, columns] = ends.preempted, self._now[columns] + ends.took
         self._action[q, columns], self._outcome[q, columns], self._took[q, columns] = action, ends.outcome, ends.took
+        self._came[q, columns], self._beyond[q, columns] = self._now[columns], ends.beyond
 
     def _wait(self) -> None:
         """Draw when transitions that wait will fire, as soon as they can; forget it when they cannot any more."""
@@ -199,6 +233,7 @@ class Play:
         if not len(columns):
             return
         self._end[q, columns] = np.inf
+        self._note_odd("beyond", self._s.vocabulary.places[q], columns[self._beyond[q, columns]])
         self._seen.note(q, columns, self._outcome[q, columns], self._action[q, columns], self._took[q, columns])
         self._good[columns] &= self._status[q, columns] <= SUCCESS  # censored ones spoil nothing
         cut = columns[self._preempted[q, columns]]
@@ -210,9 +245,12 @@ class Play:
             if able.any():
                 self._fire(self._s.moves[number], own[able])
             self._phase[q, own[~able]] = DONE  # what preempts it is not enabled: it ends by itself, with that status
+            self._note_odd("astray", self._s.moves[number].name, own[~able])
 
     def _free(self, stuck: Codes) -> None:
         """Nothing will happen in these columns: let the ended runs go any way that their status allows, else give up."""
+        for q, place in enumerate(self._s.vocabulary.places):
+            self._note_odd("beyond", place, stuck[(self._phase[q, stuck] == GOING) & self._beyond[q, stuck]])
         held = ((self._want[:, stuck] >= 0) & (self._phase[:, stuck] == DONE)).any(axis=0)
         self._want[:, stuck[held]] = -1
         dead = np.zeros(len(self._column), np.bool_)
@@ -258,5 +296,6 @@ class Play:
             setattr(self, name, getattr(self, name)[kept])
         for name in (
             "_tokens", "_phase", "_status", "_want", "_preempted", "_end", "_due", "_action", "_outcome", "_took",
+            "_came", "_beyond",
         ):  # fmt: skip
             setattr(self, name, getattr(self, name)[:, kept])

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2_contingency
 
+from coordinator.forecast.choices import choice_counts, choices_of
 from coordinator.forecast.history import Training, Values
 from coordinator.forecast.laws import Laws, dependences
 from coordinator.forecast.play import Choices, Play, Played
+from coordinator.forecast.residual import doubts, residuals, routing
 from coordinator.forecast.sampling import Drawer
 from coordinator.forecast.shares import predictive_interval, share_weight
 from coordinator.forecast.structure import SUCCESS, Structure
@@ -51,33 +52,13 @@ def figures(played: Played) -> dict[str, float]:
     }
 
 
-def measured(training: Training) -> Played:
-    """Measured throws in the form of played ones."""
-    throws = training.throws
-    return Played(
-        np.array([t.goals for t in throws], np.int64),
-        np.array([t.completed for t in throws], np.bool_),
-        np.array([t.all_success for t in throws], np.bool_),
-        np.array([np.nan if t.time is None or not t.completed else t.time for t in throws]),
-    )
-
-
-def choices_of(training: Training) -> dict[str, dict[str, float]]:
-    """How often each action was chosen."""
-    counts: dict[str, dict[str, int]] = {}
-    for throw in training.throws:
-        for run in throw.runs:
-            actions = counts.setdefault(training.task.primitive_task_of(run.place).name, {})
-            actions[run.action] = actions.get(run.action, 0) + 1
-    return {t: {a: n / sum(actions.values()) for a, n in actions.items()} for t, actions in counts.items()}
-
-
 def predict(training: Training, request: Request) -> dict[str, Any]:
     """Forecast further throws of a regime. Raises ValueError for a choice that was never measured."""
     structure, laws = Structure.of(training.task), Laws(training)
     _refuse_unmeasured(training, laws, request.choices)
     random = np.random.default_rng(request.seed)
     even = np.ones((1, len(training.throws)))
+    residual = residuals(training, _replayed(training, structure, laws, request)) if training.whole else []
     whole = _played(training, structure, laws, request, even, np.zeros(request.point, np.int64), random)
     samples, distances = _bootstrap(training, structure, laws, request, whole, random)
     point = figures(whole)
@@ -94,8 +75,13 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
         "contexts": laws.count,
         "splits": laws.splits(),
         "dependence": dependences(training),
-        "residual": residuals(training, structure, laws, request, random),
-        "routing": routing(training),
+        "residual": residual,
+        "doubts": doubts(residual, whole, request.point),
+        "routing": routing(training, request.choices),
+        "choice_runs": {name: sum(actions.values()) for name, actions in choice_counts(training).items()},
+        "asked": sorted(
+            name for name, chosen in request.choices.items() if dict(chosen) != choices_of(training).get(name)
+        ),
         "not_back": sum(t.completed and t.time is None for t in training.throws),
         "endless": round(whole.endless / request.point, 6),
         "assumptions": list(structure.assumptions),
@@ -129,6 +115,14 @@ def _played(
         names = training.vocabulary
         text = f"{names.places[place]}: no run of {names.actions[action - 1]} was measured"
         raise ValueError(text) from fault
+
+
+def _replayed(training: Training, structure: Structure, laws: Laws, request: Request) -> Played:
+    """Four times as many throws as were run, with the choices of the training."""
+    n = len(training.throws)
+    own = Request(request.runs, choices_of(training), request.seed)
+    random = np.random.default_rng([request.seed, 1])
+    return _played(training, structure, laws, own, np.ones((1, n)), np.zeros(4 * n, np.int64), random)
 
 
 def longest_of(training: Training) -> int:
@@ -199,51 +193,6 @@ def product_rule(training: Training, choices: Choices) -> dict[str, Any]:
             factors[names.places[q]] = round(r / whole, 6)
             value *= r / whole
     return {"R_conj": round(value, 6), "factors": factors}
-
-
-def residuals(
-    training: Training, structure: Structure, laws: Laws, request: Request, random: np.random.Generator
-) -> list[dict[str, Any]]:
-    """Whether the contexts keep the dependence that was measured: met goal against every place's duration class, and total time.
-
-    For each place: training throws and throws played with the training's own choices, crossed with (met or not) by the thirds of
-    the place's duration; chi-square test that both come from one law.
-    """
-    own = Request(request.runs, choices_of(training), request.seed)
-    even = np.ones((1, len(training.throws)))
-    played = _played(training, structure, laws, own, even, np.zeros(4 * len(training.throws), np.int64), random)
-    real = measured(training)
-    rows = []
-    for name, one, other in (
-        ("goal", real.goals > 0, played.goals > 0),
-        ("every run SUCCESS", real.all_success, played.all_success),
-        ("time", _thirds(real.time, real.time), _thirds(played.time, real.time)),
-    ):
-        kept_one, kept_other = one[~np.isnan(one)], other[~np.isnan(other)]
-        levels = np.unique(np.concatenate([kept_one, kept_other]))
-        table = np.array([[np.sum(x == level) for level in levels] for x in (kept_one, kept_other)])
-        p = float(chi2_contingency(table).pvalue) if len(levels) > 1 else 1.0
-        rows.append({"of": name, "p": p})
-    return rows
-
-
-def _thirds(times: Values, of: Values) -> Values:
-    known = of[~np.isnan(of)]
-    if not len(known):
-        return np.full(len(times), np.nan)
-    classes = np.searchsorted(np.quantile(known, (0.25, 0.5, 0.75, 0.9)), times, side="right").astype(np.float64)
-    return np.where(np.isnan(times), np.nan, classes)
-
-
-def routing(training: Training) -> dict[str, dict[str, int]]:
-    """By action place: how often each transition took a token out of it."""
-    out: dict[str, dict[str, int]] = {}
-    for throw in training.throws:
-        for run in throw.runs:
-            if run.taken:
-                ways = out.setdefault(run.place, {})
-                ways[run.taken] = ways.get(run.taken, 0) + 1
-    return {place: dict(sorted(ways.items())) for place, ways in sorted(out.items())}
 
 
 def _rounded(values: Values) -> list[float]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.forecast.history import Codes, Seen, Values
+from coordinator.forecast.history import CUT, Codes, Seen, Values
 from coordinator.forecast.laws import Context, Law, Laws
 
 Mask = NDArray[np.bool_]
@@ -21,6 +21,9 @@ class Ends:
     outcome: Codes
     preempted: Mask
     took: Values
+    """s; infinite where no run was ever seen to end."""
+    beyond: Mask
+    """It lasts longer than any run that was seen: its end is an extrapolation."""
 
 
 class Drawer:
@@ -38,7 +41,7 @@ class Drawer:
         Raises KeyError for an action that was never run there.
         """
         n = len(action)
-        out = Ends(np.zeros(n, np.int64), np.zeros(n, np.bool_), np.zeros(n))
+        out = Ends(np.zeros(n, np.int64), np.zeros(n, np.bool_), np.zeros(n), np.zeros(n, np.bool_))
         for code in np.unique(action):
             top = self._laws.contexts[place, int(code)]
             self._descend(top, np.flatnonzero(action == code), replicate, seen, out)
@@ -58,15 +61,29 @@ class Drawer:
         """First the outcome, then the duration from the outcome's own tree."""
         law = leaf.law
         index = self._draw(leaf.number, law.weight, law.throw, replicate[columns])
-        if not leaf.durations:
+        if not leaf.durations and not law.beyond.any():
             out.took[columns] = law.took[index] + _along(law, index, seen.took[:, columns])
             np.clip(out.took, 0.0, None, out=out.took)
             return
         out.outcome[columns], out.preempted[columns] = law.outcome[index], law.preempted[index]
+        beyond = law.beyond[index]
+        if beyond.any():
+            self._draw_beyond(leaf, columns[beyond], replicate, out)
         for code, tree in leaf.durations.items():
             own = columns[law.outcome[index] == code]
             if len(own):
                 self._descend(tree, own, replicate, seen, out)
+
+    def _draw_beyond(self, leaf: Context, columns: Codes, replicate: Codes, out: Ends) -> None:
+        """Longer than the longest run: at a constant rate, with outcomes in the shares of those that were seen."""
+        law, seen = leaf.law, np.flatnonzero(~leaf.law.beyond)
+        out.beyond[columns] = True
+        if not law.rate or not len(seen):
+            out.outcome[columns], out.preempted[columns], out.took[columns] = CUT, False, np.inf
+            return
+        index = seen[self._draw((leaf.number, "beyond"), law.weight[seen], law.throw[seen], replicate[columns])]
+        out.outcome[columns], out.preempted[columns] = law.outcome[index], law.preempted[index]
+        out.took[columns] = law.took.max() - np.log1p(-self._random.random(len(columns))) / law.rate
 
     def wait(self, transition: str, replicate: Codes) -> Values | None:
         """Waits of a transition (s), one for each column; None if it was never measured."""

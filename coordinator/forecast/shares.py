@@ -1,11 +1,25 @@
-"""Predictive law of a share of new throws: beta-binomial about the forecast, weighing as many throws as the forecast is sure of.
+"""What tests of shares need: the predictive law of a share of new throws, and Holm's adjustment for many tests.
 
-With Jeffreys' prior, so a share of 1 that was forecast from n throws still expects a miss now and then in a further n.
+The law is beta-binomial about the forecast, weighing as many throws as the forecast is sure of, with Jeffreys' prior: so a share
+of 1 that was forecast from n throws still expects a miss now and then in a further n.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
 from scipy.stats import betabinom
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Adjusted p-values: each may be compared with the level for all of them together."""
+    order = np.argsort(p_values, kind="stable")
+    out, largest = [0.0] * len(p_values), 0.0
+    for rank, i in enumerate(order):
+        largest = max(largest, min(1.0, (len(p_values) - rank) * p_values[i]))
+        out[i] = largest
+    return out
 
 
 def share_weight(value: float, sd: float, runs: int, training: int) -> float:

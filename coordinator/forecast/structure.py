@@ -7,8 +7,9 @@ from itertools import product
 
 import numpy as np
 
+from coordinator.analysis.stochastic import is_cause
 from coordinator.conditions import ConditionFault
-from coordinator.forecast.history import STATUSES, Vocabulary
+from coordinator.forecast.history import STATUSES, Vocabulary, reads_variables
 from coordinator.task import Counts, End, Kind, Status, Task, Transition
 
 
@@ -26,6 +27,10 @@ class Move:
     error: tuple[int, ...]
     going: tuple[int, ...]
     preempt: tuple[tuple[int, Counts], ...]
+    cause: bool
+    """Its preemption is a cause by which a run ends, drawn with the run; else it preempts as soon as it can fire."""
+    takes_done: bool
+    """It also takes a run that has ended but whose token is still there (its priority is higher)."""
     starts: tuple[int, ...]
     """Action places in which it starts a run."""
     waits: bool
@@ -36,6 +41,8 @@ class Move:
     """Which statuses of the runs it takes (axes: normal, then error) its condition admits; None: any."""
     priority: int
     weight: float
+    yields: bool
+    """Of equal priority, another one fires first: a run's end goes before its preemption."""
     is_goal: bool
     takes_run: bool
     """It takes a token out of the runs place."""
@@ -61,6 +68,8 @@ class Structure:
         for place in flat.places.values():
             if place.kind is Kind.ACTION and (place.servers or 1) > 1:
                 raise ValueError(f"places.{place.name}: forecasts know one run at a time; give it servers = 1")
+        for t in flat.transitions.values():
+            _refuse_unknown_preemption(t)
         assumptions: list[str] = []
         moves = tuple(_move(flat, vocabulary, t, i, assumptions) for i, t in enumerate(flat.transitions.values()))
         initial = np.array(flat.net.initial, np.int64)
@@ -77,7 +86,7 @@ def _move(flat: Task, vocabulary: Vocabulary, t: Transition, number: int, assump
         end: tuple(number_of[a.place] for a in t.inputs if a.end is end) for end in (End.NORMAL, End.ERROR, End.GOING)
     }
     preempt = tuple((number_of[a.place], a.counts or Counts.NONE) for a in t.inputs if a.end is End.PREEMPT)
-    if t.when is not None and not _judges_statuses(t):
+    if reads_variables(t):
         assumptions.append(f"{t.name}: how often its condition holds is taken from the runs that it took")
     waits_known = [flat.events[e].mean_wait for e in t.events]
     means = [mean for mean in waits_known if mean is not None]
@@ -91,6 +100,8 @@ def _move(flat: Task, vocabulary: Vocabulary, t: Transition, number: int, assump
         by_end[End.ERROR],
         by_end[End.GOING],
         preempt,
+        is_cause(t),
+        _takes_done(flat, t),
         tuple(number_of[o.place] for o in t.outputs if o.place in number_of),
         bool(t.events) or t.after is not None,
         t.after,
@@ -98,18 +109,40 @@ def _move(flat: Task, vocabulary: Vocabulary, t: Transition, number: int, assump
         _allowed(t, [vocabulary.places[q] for q in by_end[End.NORMAL] + by_end[End.ERROR]]),
         t.priority,
         t.weight if t.weight is not None else 1.0,
+        bool(preempt) and t.weight is None,
         t.name in flat.goal_transitions,
         any(a.place == flat.runs_place for a in t.inputs),
     )
 
 
-def _judges_statuses(t: Transition) -> bool:
-    taken = {f"{a.place}.status" for a in t.inputs if a.end is not None}
-    return t.when is not None and t.when.names <= taken
+def _refuse_unknown_preemption(t: Transition) -> None:
+    """What preempts must follow from the marking, or be measured: an event's time from the begin of the one run that it takes."""
+    runs = [a for a in t.inputs if a.end is not None]
+    if is_cause(t) or not any(a.end is End.PREEMPT for a in runs):
+        return
+    if reads_variables(t) and not any(a.end in (End.NORMAL, End.ERROR) for a in runs):
+        raise ValueError(
+            f"transitions.{t.name}: when it preempts is decided by variables alone, and forecasts know no variables; let it take "
+            "the ended run that sets them, too, or raise an event instead"
+        )
+    if t.events:
+        places = ", ".join(a.place for a in runs)
+        raise ValueError(
+            f"transitions.{t.name}: forecasts know an event that preempts one run, this one looks at several ({places}); let "
+            "the event preempt one of them and put a token into a control place, and let a transition without an event take "
+            "that token and the others"
+        )
+
+
+def _takes_done(flat: Task, t: Transition) -> bool:
+    """As the engine does: a preemption of declared higher priority also takes what has ended."""
+    places = {a.place for a in t.inputs if a.end is End.PREEMPT}
+    rivals = [u for u in flat.transitions.values() if any(a.place in places and a.end is End.NORMAL for a in u.inputs)]
+    return bool(places) and t.priority > max((u.priority for u in rivals), default=t.priority)
 
 
 def _allowed(t: Transition, places: list[str]) -> np.ndarray | None:
-    if t.when is None or not _judges_statuses(t):
+    if t.when is None or reads_variables(t):
         return None
     out = np.zeros((len(STATUSES),) * len(places), np.bool_)
     for combination in product(range(len(STATUSES)), repeat=len(places)):

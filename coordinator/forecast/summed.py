@@ -31,7 +31,7 @@ def read_estimates(path: Path) -> Estimates:
 def trainings_of(task: Task, estimates: Estimates) -> dict[str, Training]:
     """Of estimates, by regime."""
     regimes = sorted({regime_of(key.context) for key in estimates.tallies})
-    return {regime: Training.of(task, _throws(task, estimates, regime)) for regime in regimes}
+    return {regime: Training.of(task, _throws(task, estimates, regime), whole=False) for regime in regimes}
 
 
 def _throws(task: Task, estimates: Estimates, regime: str) -> list[Throw]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from coordinator.forecast.residual import NEGLIGIBLE
+
 WORDS = {
     "R_goal": "R_goal",
     "P_complete": "P_complete",
@@ -32,12 +34,10 @@ def forecast_text(made: Mapping[str, Any]) -> str:
                     f"    {found['places'][0]} and {found['places'][1]} depend on each other: p = {found['p']:.1e}"
                 )
         lines.append(f"    {said['contexts']} contexts; {_worst(said['residual'])}")
-        if said["endless"] > 0.0005:
-            lines.append(
-                f"    note: {said['endless']:.1%} of the throws played never end: branches that watch each other need more "
-                "training throws, so that the contexts can tell them apart"
-            )
+        if 0.0005 < said["endless"] <= NEGLIGIBLE:
+            lines.append(f"    note: {said['endless']:.1%} of the throws played never end")
         lines += [f"    note: {note}" for note in said["assumptions"]]
+        lines += [f"    DOUBTFUL: {doubt}" for doubt in said["doubts"]]
     return "\n".join(lines)
 
 
@@ -49,6 +49,8 @@ def _exact_lines(gspn: Mapping[str, Any]) -> list[str]:
 
 
 def _worst(residual: Sequence[Mapping[str, Any]]) -> str:
+    if not residual:
+        return "from an estimates file: no throws to check against"
     worst = min(residual, key=lambda row: row["p"])
     return f"played throws against the training's own: least p {worst['p']:.2f} ({worst['of']})"
 
@@ -122,6 +124,8 @@ def agreement_text(found: Mapping[str, Any]) -> str:
     lines += [
         f"ways out of {row['place']} differ, regime {row['regime'] or '-'}: p = {row['p_holm']:.1e}" for row in odd
     ]
+    for regime, doubts in found["doubts"].items():
+        lines += [f"note: registered although doubtful, regime {regime or '-'}: {doubt}" for doubt in doubts]
     if not found["same_block"]:
         lines.append("note: the training had another --block: the first throws of a cell are a different share of all")
     if not found["same_task_file"]:

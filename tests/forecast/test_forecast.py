@@ -13,12 +13,14 @@ from hypothesis import strategies as st
 from scipy.stats import binom
 
 from coordinator.campaign.throws import RunEntry, Throw
-from coordinator.forecast.agreement import agreement, holm, quantile_interval
+from coordinator.forecast.agreement import agreement, quantile_interval
+from coordinator.forecast.choices import choices_of
 from coordinator.forecast.history import Training
 from coordinator.forecast.laws import Laws, dependences
-from coordinator.forecast.predict import Request, choices_of, distance, figures, measured, predict
+from coordinator.forecast.predict import Request, distance, figures, predict
 from coordinator.forecast.registered import ForecastError, read, register, write
-from coordinator.forecast.shares import predictive_interval, share_p_value
+from coordinator.forecast.residual import measured
+from coordinator.forecast.shares import holm, predictive_interval, share_p_value
 from coordinator.task import Task
 from tests.forecast.conftest import Make
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from coordinator.campaign.throws import RunEntry, Throw
+from coordinator.forecast.choices import choices_of
 from coordinator.forecast.history import Training
 from coordinator.forecast.laws import Laws
 from coordinator.forecast.play import Play, Played
-from coordinator.forecast.predict import choices_of
 from coordinator.forecast.sampling import Drawer
 from coordinator.forecast.structure import Structure
 from coordinator.taskfile import loads
@@ -226,6 +226,36 @@ out = ["end"]
         played = play(text, throws, task=ending)
         assert np.mean(played.completed) == pytest.approx(0.75, abs=0.04)
         assert np.isnan(played.time[~played.completed]).all()
+
+
+@pytest.mark.parametrize(("priority", "completes"), [(1, True), (0, False)])
+def test_a_preemption_of_higher_priority_takes_what_has_ended_too(priority: int, completes: bool) -> None:
+    """a has ended and waits for b, which is lost: only a transition above the normal exits takes a then, as in the engine."""
+    text = f"""
+[places.alarm]
+kind = "control"
+[transitions.begin]
+in = ["jobs"]
+out = ["a", "b"]
+[transitions.join]
+in = ["a:normal", "b:normal"]
+out = ["end"]
+[transitions.b_lost]
+in = ["b:error"]
+out = ["alarm"]
+[transitions.drop]
+in = ["alarm", "a:preempt=none"]
+out = ["end"]
+priority = {priority}
+[transitions.a_lost]
+in = ["a:error", "alarm"]
+out = ["end"]
+"""
+    runs = [entry("a", 1.0, taken="drop"), entry("b", 2.0, "error", "b_lost")]
+    played = play(text, [Throw(1, 0.0, runs=runs)])
+    assert played.completed.all() == played.completed.any() == completes
+    assert not played.all_success.any()
+    assert played.ways.get("a", {}) == ({"drop": 2000} if completes else {})
 
 
 SERVERS = """
