@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2_contingency
+from scipy.stats import chi2, chi2_contingency
 
 from coordinator.forecast.history import CENSORED, NONE, Codes, Runs, Seen, Training, Values, Vocabulary
 
@@ -26,6 +26,8 @@ ALPHA = 0.01
 LEAST = 30
 """Runs in a context at least."""
 DEEPEST = 6
+OWN = 0.7
+"""A factor of the runs' own place goes before the best one if the logarithm of its p-value is at least this share of its."""
 SURE = 3.0
 """Standard errors beyond which a trend within a context counts."""
 GROUPS = 6
@@ -209,7 +211,11 @@ def _trend(runs: Runs) -> Trend | None:
 
 
 def best_split(runs: Runs, *, outcomes: bool) -> tuple[Split, Codes] | None:
-    """The most significant split of runs and the child of each run; None if no test rejects independence."""
+    """The most significant split of runs and the child of each run; None if no test rejects independence.
+
+    Of factors that tell about as much, one of the runs' own place: branches side by side go on in step, so the visits of one tell
+    those of the other in every throw that was run, but the branches drift apart where they are played.
+    """
     response = runs.outcome if outcomes else _classes(runs.took)
     groups = GROUPS // 2 if outcomes else GROUPS
     candidates: list[tuple[float, Split, Codes]] = []
@@ -217,11 +223,14 @@ def best_split(runs: Runs, *, outcomes: bool) -> tuple[Split, Codes] | None:
         for kind in ("outcome", "action", "visits", "took"):
             made = _by_duration(runs, place, groups) if kind == "took" else _candidate(runs, kind, place)
             if made is not None:
-                candidates.append((_p_value(made[1], response), *made))
+                candidates.append((_log_p(made[1], response), *made))
     if not candidates:
         return None
-    p, split, child = min(candidates, key=lambda c: c[0])
-    p = min(1.0, p * len(candidates))
+    best = min(candidates, key=lambda c: c[0])
+    place = int(runs.place[0])
+    own = min((c for c in candidates if c[1].place == place), key=lambda c: c[0], default=best)
+    log_p, split, child = own if own[0] < OWN * best[0] else best
+    p = min(1.0, math.exp(log_p) * len(candidates))
     return (replace(split, p_value=p), child) if p < ALPHA else None
 
 
@@ -235,7 +244,9 @@ def _candidate(runs: Runs, kind: str, place: int) -> tuple[Split, Codes] | None:
     found, counts = np.unique(codes, return_counts=True)
     large = [int(c) for c, n in zip(found, counts, strict=True) if n >= LEAST]
     if len(found) - len(large) and len(codes) - counts[counts >= LEAST].sum() < LEAST and large:
-        large.remove(min(large, key=lambda c: int(counts[found == c][0])))  # the rest joins the smallest large class
+        # The rest joins the most visits that are frequent: a fourth visit is more like a third one than like a first one. Of
+        # classes without an order it joins the smallest large one.
+        large.remove(max(large) if kind == "visits" else min(large, key=lambda c: int(counts[found == c][0])))
     groups = {code: i for i, code in enumerate(large)}
     rest = bool(len(found) > len(large))
     if len(groups) + rest < 2:
@@ -258,12 +269,13 @@ def _by_duration(runs: Runs, place: int, most: int) -> tuple[Split, Codes] | Non
     return (split, child) if len(counts) > 1 and counts.min() >= LEAST // 2 else None
 
 
-def _p_value(child: Codes, response: Codes) -> float:
-    """p-value of the chi-square test of independence; 1 where one of them does not vary."""
+def _log_p(child: Codes, response: Codes) -> float:
+    """Logarithm of the p-value of the chi-square test of independence; 0 where one of them does not vary."""
     table = crossed(child, response)
     if min(table.shape) < 2:
-        return 1.0
-    return float(chi2_contingency(table).pvalue)
+        return 0.0
+    test = chi2_contingency(table)
+    return float(chi2.logsf(test.statistic, test.dof))
 
 
 def crossed(one: Codes, other: Codes) -> np.ndarray:

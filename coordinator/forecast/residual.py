@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2_contingency
+from scipy.stats import chi2_contingency, ttest_ind
 
 from coordinator.forecast.history import Training, Values
 from coordinator.forecast.play import Choices, Played
@@ -32,7 +32,7 @@ def measured(training: Training) -> Played:
 def residuals(training: Training, played: Played) -> list[dict[str, Any]]:
     """Chi-square tests that measured and played throws come from one law, with p and Holm's p.
 
-    Goals, completion, all-SUCCESS, classes of the time, and for each place by which transitions its runs left it.
+    Goals, completion, all-SUCCESS, classes of the time, its mean, and for each place by which transitions its runs left it.
     """
     real = measured(training)
     tables = {
@@ -43,9 +43,11 @@ def residuals(training: Training, played: Played) -> list[dict[str, Any]]:
     }
     for place, ways in routing(training).items():
         tables[f"ways out of {place}"] = ways_table(ways, played.ways.get(place, {}))
-    alone = [_p_value(table) for table in tables.values()]
+    alone = {name: _p_value(table) for name, table in tables.items()}
+    alone["mean time"] = _same_mean(real.time, played.time)
     return [
-        {"of": name, "p": p, "p_holm": together} for name, p, together in zip(tables, alone, holm(alone), strict=True)
+        {"of": name, "p": p, "p_holm": together}
+        for (name, p), together in zip(alone.items(), holm(list(alone.values())), strict=True)
     ]
 
 
@@ -53,6 +55,14 @@ def _shares(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     kept_one, kept_other = one[~np.isnan(one)], other[~np.isnan(other)]
     levels = np.unique(np.concatenate([kept_one, kept_other]))
     return np.array([[np.sum(x == level) for level in levels] for x in (kept_one, kept_other)])
+
+
+def _same_mean(one: Values, other: Values) -> float:
+    """Welch's test: classes say little about a few throws that last very long."""
+    kept_one, kept_other = one[~np.isnan(one)], other[~np.isnan(other)]
+    if min(len(kept_one), len(kept_other)) < 2 or kept_one.std() + kept_other.std() == 0:
+        return 1.0
+    return float(ttest_ind(kept_one, kept_other, equal_var=False).pvalue)
 
 
 def _p_value(table: np.ndarray) -> float:

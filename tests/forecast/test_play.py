@@ -161,6 +161,49 @@ def test_a_loop_that_is_counted_is_no_geometric_one() -> None:
     assert set(played.time.tolist()) == {3.0}
 
 
+def test_a_rare_further_round_is_like_the_last_frequent_one() -> None:
+    """Five of 65 are interrupted a third time, and then done: nobody goes round for ever."""
+
+    def rounds(n: int) -> Throw:
+        ends = [("error", "again")] * (n - 1) + [("success", "done")]
+        return Throw(1, 0.0, runs=[RunEntry("a", "run_a", float(k), 1.0, s, taken=t) for k, (s, t) in enumerate(ends)])
+
+    played = play(LOOP, [rounds(3)] * 60 + [rounds(4)] * 5)
+    assert played.completed.all()
+    assert played.time.mean() == pytest.approx((60 * 3 + 5 * 4) / 65, abs=0.05)
+
+
+def test_branches_that_go_in_step_are_told_apart_by_their_own_rounds() -> None:
+    """Rounds of either branch tell those of the other in every throw that was run; where they are played they drift apart."""
+    text = """
+[transitions.begin]
+in = ["jobs"]
+out = ["a", "b"]
+[transitions.a_again]
+in = ["a:error"]
+out = ["a"]
+[transitions.b_again]
+in = ["b:error"]
+out = ["b"]
+[transitions.done]
+in = ["a:normal", "b:normal"]
+out = ["end"]
+"""
+    random = np.random.default_rng(1)
+    throws = []
+    for _ in range(60):
+        runs = []
+        for k, drift in enumerate(random.uniform(-0.3, 0.3, 3)):
+            for place, begun in (("a", 2.0 * k), ("b", 2.0 * k + 0.5)):
+                end = ("error", f"{place}_again") if k < 2 else ("success", "done")
+                runs.append(RunEntry(place, f"run_{place}", begun, 1.5 + drift, end[0], taken=end[1]))
+        throws.append(Throw(1, 0.0, runs=runs))
+    training = Training.of(loads(HEAD.replace("{task}", 'final = "end == 1"\nruns_place = "jobs"') + text, "n"), throws)
+    found = {s["place"]: s["by"] for s in Laws(training).splits() if s["of"] == "outcome"}
+    assert found == {"a": "visits of a", "b": "visits of b"}
+    assert play(text, throws).completed.all()
+
+
 def test_timers_and_events_race() -> None:
     """An event at 1 or 3 s against a timer of 2 s: half each; a timer that was never seen to fire counts as it is declared."""
     text = """
