@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 
 from coordinator.campaign.observed import ESTIMATES, add_row, context_of
-from coordinator.campaign.plan import Plan
+from coordinator.campaign.plan import TABLE, Plan
 from coordinator.campaign.rows import Row
 from coordinator.campaign.spent import sessions, times
-from coordinator.campaign.table import TABLE
 from coordinator.learning.estimate import Key, Tally
 from coordinator.learning.intervals import wilson
 from coordinator.learning.learning import Estimates

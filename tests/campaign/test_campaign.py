@@ -9,12 +9,13 @@ import json
 import os
 import signal
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from coordinator.campaign.conduct import Campaign, Progress
-from coordinator.campaign.plan import CampaignError, Plan
+from coordinator.campaign.plan import MANIFEST, CampaignError, Plan, read_manifest, write_manifest
 from coordinator.campaign.pool import LocalPool
 from coordinator.campaign.table import TABLE, read_table
 from coordinator.campaign.worker import serve
@@ -30,8 +31,6 @@ def table(folder: Path) -> bytes:
 
 def test_blocks_cover_all_throws_whatever_their_size(toy_plan: Plan) -> None:
     """Regimes take turns and share their seeds; numbers and seeds come from the index alone."""
-    from dataclasses import replace
-
     for runs, block in ((1, 4), (7, 3), (12, 5), (20, 1)):
         blocks = replace(toy_plan, runs=runs, block=block).blocks
         assert [b.index for b in blocks] == list(range(len(blocks)))
@@ -109,6 +108,59 @@ def test_another_campaign_in_the_same_folder_is_refused(conduct: Conduct) -> Non
     conduct("a")
     with pytest.raises(CampaignError, match="seed, selector differ"):
         conduct("a", seed=5, selector="random")
+
+
+def plan_cut_off(folder: Path, size: int) -> Path:
+    """A manifest of which the disk kept so many bytes."""
+    path = folder / MANIFEST
+    path.write_bytes(path.read_bytes()[:size])
+    return path
+
+
+@pytest.mark.parametrize("size", [0, 1, 100])
+def test_a_manifest_that_was_cut_off_says_what_to_do(conduct: Conduct, size: int) -> None:
+    """Before the first block: remove it; with a table beside it: the folder. What is said helps."""
+    whole = conduct("whole")
+    with pytest.raises(KeyboardInterrupt):
+        conduct("a", fails_at=0)
+    path = plan_cut_off(whole.folder.parent / "a", size)
+    with pytest.raises(
+        CampaignError, match=r"campaign.json is empty, torn.*remove campaign.json and give the command again"
+    ):
+        conduct("a")
+    path.unlink()
+    assert table(conduct("a").folder) == table(whole.folder)
+    plan_cut_off(path.parent, size)
+    with pytest.raises(CampaignError, match=r"torn.*remove .*a to begin anew, or give another --out"):
+        conduct("a")
+
+
+@pytest.mark.parametrize("text", ["[]", "7", '{"schema": 1}', '{"schema": 1, "regimes": 3}'])
+def test_a_manifest_that_is_no_plan_is_refused(conduct: Conduct, text: str) -> None:
+    """Though it is JSON."""
+    folder = conduct("a").folder
+    (folder / MANIFEST).write_text(text, encoding="utf-8")
+    with pytest.raises(CampaignError, match="no plan"):
+        read_manifest(folder)
+
+
+def test_a_kill_while_the_manifest_is_written_leaves_the_old_one_or_the_new_one(
+    conduct: Conduct, toy_plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever had been written when the process died: before the file is on the disk it has another name."""
+    folder = conduct("a").folder
+    before = (folder / MANIFEST).read_bytes()
+
+    def killed(_: int) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fsync", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_manifest(folder, replace(toy_plan, seed=9))
+    assert (folder / MANIFEST).read_bytes() == before
+    monkeypatch.undo()
+    write_manifest(folder, replace(toy_plan, seed=9))
+    assert read_manifest(folder).seed == 9
 
 
 def test_files_that_changed_are_refused(conduct: Conduct, tmp_path: Path) -> None:
