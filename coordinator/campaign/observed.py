@@ -33,7 +33,7 @@ def observation(task: Task, run: RunEntry) -> Observation:
     preempted = run.cancelled and bool(run.taken)
     return Observation(
         Status(run.status) if run.status else None,
-        run.took if preempted else run.seconds,
+        run.took if preempted else max(0.0, run.seconds),
         run.cause,
         Executed(run.executed),
         run.cost if measure == "cpu" else None,

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import secrets
 import sqlite3
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,7 +21,6 @@ from coordinator.learning.estimate import Key, Tally
 from coordinator.learning.estimate import merge as merge_tallies
 from coordinator.learning.joining import joined, trials
 from coordinator.learning.learning import Estimates
-from coordinator.learning.moments import Moments
 from coordinator.learning.passage import Flow, PassageKey
 from coordinator.learning.passage import merge as merge_flows
 
@@ -89,12 +88,12 @@ class EstimatesFile:
             return Kept()
         about = dict(db.execute("SELECT name, value FROM about"))
         kept = Kept(about["origin"], int(about["generation"]))
-        for task, action, context, body in db.execute("SELECT primitive_task, action, context, body FROM tally"):
-            key = Key(task, action, context)
-            kept.estimates.tallies[key] = merge_tallies(kept.estimates.tally(key), _tally(body))
-        for task, name, context, body in db.execute("SELECT task, transition_name, context, body FROM flow"):
-            where = PassageKey(task, name, context)
-            kept.estimates.flows[where] = merge_flows(kept.estimates.flows.get(where, Flow()), _flow(body))
+        for row in db.execute("SELECT * FROM tally"):
+            key = Key(*row[1:4])
+            kept.estimates.tallies[key] = merge_tallies(kept.estimates.tally(key), _tally(row))
+        for row in db.execute("SELECT * FROM flow"):
+            where = PassageKey(*row[1:4])
+            kept.estimates.flows[where] = merge_flows(kept.estimates.flows.get(where, Flow()), _flow(row))
         for task, name, state in db.execute("SELECT primitive_task, name, state FROM selector"):
             kept.selectors[task, name] = json.loads(state)
         return kept
@@ -176,10 +175,10 @@ class EstimatesFile:
             origin = _about(db, "origin")
             rows = {name: db.execute(f"SELECT * FROM {name}").fetchall() for name in ("tally", "flow", "selector")}
             gone = db.execute("SELECT * FROM forgotten").fetchall()
-            for *_, body in rows["tally"]:
-                _tally(body)
-            for *_, body in rows["flow"]:
-                _flow(body)
+            for row in rows["tally"]:
+                _tally(row)
+            for row in rows["flow"]:
+                _flow(row)
             states = [(task, name, _state(body)) for task, name, _, body in rows["selector"]]
         with self._writing() as mine:
             _take_later(mine, "tally", rows["tally"], "origin, primitive_task, action, context")
@@ -276,9 +275,9 @@ def _about(db: sqlite3.Connection, name: str) -> str:
 def _add_tally(db: sqlite3.Connection, origin: str, key: Key, gained: Tally) -> None:
     where = (origin, key.primitive_task, key.action, key.context)
     row = db.execute(
-        "SELECT body FROM tally WHERE origin = ? AND primitive_task = ? AND action = ? AND context = ?", where
+        "SELECT * FROM tally WHERE origin = ? AND primitive_task = ? AND action = ? AND context = ?", where
     ).fetchone()
-    tally = merge_tallies(_tally(row[0]) if row else Tally(), gained)
+    tally = merge_tallies(_tally(row) if row else Tally(), gained)
     body = json.dumps(tally.to_plain(), separators=(",", ":"))
     db.execute("INSERT OR REPLACE INTO tally VALUES (?, ?, ?, ?, ?, ?)", (*where, tally.changes, body))
 
@@ -286,10 +285,10 @@ def _add_tally(db: sqlite3.Connection, origin: str, key: Key, gained: Tally) -> 
 def _add_flow(db: sqlite3.Connection, origin: str, key: PassageKey, gained: Flow) -> None:
     where = (origin, key.task, key.transition, key.context)
     row = db.execute(
-        "SELECT body FROM flow WHERE origin = ? AND task = ? AND transition_name = ? AND context = ?", where
+        "SELECT * FROM flow WHERE origin = ? AND task = ? AND transition_name = ? AND context = ?", where
     ).fetchone()
-    flow = merge_flows(_flow(row[0]) if row else Flow(), gained)
-    body = json.dumps([flow.fired, flow.waits.to_plain()])
+    flow = merge_flows(_flow(row) if row else Flow(), gained)
+    body = json.dumps(flow.to_plain())
     db.execute("INSERT OR REPLACE INTO flow VALUES (?, ?, ?, ?, ?, ?)", (*where, flow.fired, body))
 
 
@@ -331,8 +330,29 @@ def _take_later(db: sqlite3.Connection, table: str, rows: list[tuple[Any, ...]],
     )
 
 
-def _tally(body: str) -> Tally:
-    return Tally.of_plain(json.loads(body))
+def _tally(row: Sequence[Any]) -> Tally:
+    """Of a row of the table `tally`. Raises ValueError naming the row."""
+    _, task, action, context, version, body = row
+    try:
+        tally = Tally.of_plain(json.loads(body))
+        _agree(tally.changes, version)
+    except (ValueError, KeyError, TypeError) as fault:
+        raise ValueError(f"{task}, {action}{_in(context)}: {_said(fault)}") from fault
+    return tally
+
+
+def _agree(changes: int, version: int) -> None:
+    """A higher version would win every merge, whatever stands behind it."""
+    if changes != version:
+        raise ValueError(f"version {version} of what was changed {changes} times")
+
+
+def _in(context: str) -> str:
+    return f" ({context})" if context else ""
+
+
+def _said(fault: Exception) -> str:
+    return f"{fault} is missing" if isinstance(fault, KeyError) else str(fault)
 
 
 def _state(body: str) -> dict[str, Any]:
@@ -341,6 +361,12 @@ def _state(body: str) -> dict[str, Any]:
     return state
 
 
-def _flow(body: str) -> Flow:
-    fired, waits = json.loads(body)
-    return Flow(int(fired), Moments.of_plain(waits))
+def _flow(row: Sequence[Any]) -> Flow:
+    """Of a row of the table `flow`. Raises ValueError naming the row."""
+    _, _, transition, context, version, body = row
+    try:
+        flow = Flow.of_plain(json.loads(body))
+        _agree(flow.fired, version)
+    except (ValueError, KeyError, TypeError, IndexError) as fault:
+        raise ValueError(f"transition {transition}{_in(context)}: {_said(fault)}") from fault
+    return flow

@@ -26,6 +26,9 @@ from coordinator.mission.partners import FirstAlternative
 from coordinator.task import Task
 from services.comm.notice import Progress
 
+LARGEST = 1e150
+"""Numbers of results from here on are no costs: their squares could not be summed."""
+
 
 class ContextError(ValueError):
     """A context is not one that the task can tell apart."""
@@ -227,7 +230,7 @@ class LearningSelector(FirstAlternative):
         context = self.context if going.context is None else going.context
         preempted = (going.taken_by or "") if record.cancelled else None
         until = going.taken_at if preempted else now
-        seconds = record.seconds if preempted is None else round(max(0.0, until - going.entered), 6)
+        seconds = max(0.0, record.seconds) if preempted is None else round(max(0.0, until - going.entered), 6)
         result = going.ended
         outcome = Observation(
             record.status,
@@ -258,11 +261,11 @@ class LearningSelector(FirstAlternative):
 
 
 def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
-    """The numbers of a result; anything else is no cost."""
+    """The numbers of a result; anything else is no cost. What is not finite would spoil every sum that it came into."""
     return {
         name: float(value)
         for name, value in sorted(values.items())
-        if isinstance(value, int | float) and not isinstance(value, bool)
+        if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < LARGEST
     }
 
 

@@ -316,6 +316,33 @@ def test_a_bad_file_gives_one_clear_error(tmp_path: Path, spoil: Any, said: str)
         EstimatesFile(tmp_path / "good.db").merge(path)
 
 
+@pytest.mark.parametrize(
+    ("table", "old", "new", "version", "said"),
+    [
+        ("tally", '[["success","",2]]', '[["success","",-5]]', 999, "pick, pick_fast (regime=A): -5 runs"),
+        ("tally", '"unknown":0', '"unknown":7', 2, "pick, pick_fast (regime=A): 7 runs of which"),
+        ("tally", '"unknown"', '"unheard"', 2, "'unknown' is missing"),
+        ("tally", "{", "{", 999, "version 999 of what was changed 2 times"),
+        ("flow", "[2,", "[-2,", 999, "transition begin (regime=A): -2 firings"),
+        ("flow", "[2, [2,", "[1, [2,", 1, "2 waits: a whole number from 0 to 1"),
+        ("flow", "[2,", "[2,", 999, "version 999"),
+    ],
+)
+def test_a_corrupted_file_poisons_no_other(
+    tmp_path: Path, table: str, old: str, new: str, version: int, said: str
+) -> None:
+    """It is refused by name, whatever its version, and the file that should have taken it is as it was."""
+    one, other = file_of(tmp_path / "one.db", 3), file_of(tmp_path / "other.db", 2)
+    written(other.path, f"UPDATE {table} SET body = replace(body, '{old}', '{new}'), version = {version}")
+    before = known(one)
+    for use in (other.read, lambda: one.merge(other.path)):
+        with pytest.raises(EstimatesError) as fault:
+            use()
+        assert said in str(fault.value)
+        assert str(other.path) in str(fault.value)
+    assert known(one) == before
+
+
 def test_merging_from_nowhere_is_refused(tmp_path: Path) -> None:
     """And makes no file."""
     with pytest.raises(EstimatesError, match="no such file"):
