@@ -7,6 +7,7 @@ keep them; so a resumed run, whose recorded steps are shown to it again, has the
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -125,7 +126,9 @@ class LearningSelector(FirstAlternative):
         self._declared = declared
         self._values: Mapping[str, Any] = {}
         self._going: dict[str, _Going] = {}
-        self._deferred: dict[str, End] = {}
+        self._deferred: dict[str, tuple[End, int]] = {}
+        """Runs whose verdict may still come, each with the trials of its primitive task and context up to then."""
+        self._trials: Counter[tuple[str, str]] = Counter()
         self._waiting: dict[str, float] = {}
         self._watched = _waits_for_events(learning.task)
 
@@ -243,8 +246,11 @@ class LearningSelector(FirstAlternative):
             round(max(0.0, now - going.entered - seconds), 6) if preempted is None else None,
         )
         end = End(record.primitive_task, record.action, context, outcome)
+        selector, where = self.learning.selectors.get(end.primitive_task), (end.primitive_task, context)
+        if selector is not None and selector.learns_from(end.action, outcome):
+            self._trials[where] += 1
         if record.deferred:
-            self._deferred[record.run] = end
+            self._deferred[record.run] = (end, self._trials[where])
         self._note(end)
 
     def _cpu(self, record: RunRecorded, result: RunEnded | None) -> float | None:
@@ -254,10 +260,11 @@ class LearningSelector(FirstAlternative):
         return None if result is None else result.cpu_seconds
 
     def _corrected(self, corrected: Corrected) -> None:
-        end = self._deferred.pop(corrected.run, None)
+        end, trials = self._deferred.pop(corrected.run, (None, 0))
         if end is not None:
             what = (end.primitive_task, end.action, end.context, end.outcome)
-            self._note(Correction(*what, corrected.status, corrected.cause))
+            age = self._trials[end.primitive_task, end.context] - trials
+            self._note(Correction(*what, corrected.status, corrected.cause, age))
 
 
 def _numbers(values: Mapping[str, Any]) -> dict[str, float]:

@@ -116,7 +116,7 @@ class Learning:
         elif isinstance(record, End):
             selector.update(record.context, record.action, record.outcome)
         elif record.was.status is not None:
-            selector.correct(record.context, record.action, record.was.status, record.status)
+            selector.correct(record.context, record.action, record.was.status, record.status, record.age)
 
     # --- reading ---------------------------------------------------------------------------------------------------
 
