@@ -133,7 +133,7 @@ class Campaign:
     def result(self) -> dict[str, Any]:
         """The result so far, as the command line writes it; the estimates file is written beside the table."""
         name = identity(self.plan)
-        summary = Summary.of(self.bench.task, self.table.rows(), name)
+        summary = Summary.of(self.bench.task, self.table.rows(), name, self.plan.options)
         write_estimates(self.folder, summary.estimates, self.policy.selectors(), f"campaign/{name}")
         return result_of(self.folder, self.plan, summary, self.policy.state())
 

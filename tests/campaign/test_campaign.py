@@ -10,17 +10,21 @@ import os
 import signal
 from collections.abc import Iterator
 from dataclasses import replace
+from math import isfinite
 from pathlib import Path
 
 import pytest
 
 from coordinator.campaign.conduct import Campaign, Progress
-from coordinator.campaign.plan import MANIFEST, CampaignError, Plan, read_manifest, write_manifest
+from coordinator.campaign.plan import MANIFEST, CampaignError, Plan, digest, read_manifest, write_manifest
 from coordinator.campaign.pool import LocalPool
+from coordinator.campaign.summary import Summary, comparisons, result_of
 from coordinator.campaign.table import TABLE, read_table
 from coordinator.campaign.worker import serve
+from coordinator.cli.campaign import text_of
 from coordinator.launch import Setting, lockstep_cell
-from tests.campaign.conftest import Conduct
+from coordinator.learning.objective import Question, compare
+from tests.campaign.conftest import SERVICES, TASK, Conduct
 from tests.waiting import beat
 
 
@@ -290,12 +294,55 @@ def test_parquet_where_pyarrow_is_there(conduct: Conduct) -> None:
 
 def test_an_action_that_cannot_be_loaded_is_bad_input(conduct: Conduct, tmp_path: Path) -> None:
     """Named by the location file, not by a lost worker."""
-    from coordinator.campaign.plan import digest
-    from tests.campaign.conftest import SERVICES, TASK
-
     other = tmp_path / "services.toml"
     other.write_text(
         SERVICES.read_text(encoding="utf-8").replace("toy_actions:prepare", "no_such_module:prepare"), encoding="utf-8"
     )
     with pytest.raises(CampaignError, match="no_such_module"):
         conduct("a", services=str(other), digests={"task": digest(TASK), "services": digest(other)})
+
+
+def test_j_is_made_with_the_target_and_rho_that_were_given(conduct: Conduct) -> None:
+    """Else with the target that the task file declares: cost is that of the hardest regime which still reaches it."""
+    campaign = conduct("a", selector="round_robin", runs=240)
+    task, plan = campaign.bench.task, campaign.plan
+    assert campaign.result()["judged"]["look"]["target"] == 0.9  # declared, if only by leaving it out
+    sets = []
+    for options in ({}, {"target": 0.3}, {"target": 0.6}, {"target": 0.99}, {"rho": 0.25}):
+        summary = Summary.of(task, campaign.table.rows(), options=options)
+        result = result_of(campaign.folder, plan, summary, {})
+        judged, tallies = result["judged"]["look"], summary.estimates.of("look")
+        target = options.get("target", 0.9)
+        expected = compare(tallies, Question("wall", target, options.get("rho")))
+        assert (judged["cost"], judged["target"], judged["regimes"]) == ("wall", target, ["easy", "rough"])
+        assert judged["rho"] == pytest.approx(expected.rho)
+        assert result["J"]["look"] == {f.action: round(f.j, 6) if isfinite(f.j) else None for f in expected.figures}
+        inside = {a: [c for c, t in by.items() if t.interval()[0] >= target] for a, by in tallies.items()}
+        assert judged["meet_target"] == [a for a in task.primitive_tasks["look"].alternatives if inside[a]]
+        for f in expected.figures:
+            assert f.reliability == min(tally.reliability for tally in tallies[f.action].values())
+            if f.scenario is not None:
+                there = tallies[f.action][f.scenario]
+                assert there.reliability == min(tallies[f.action][c].reliability for c in inside[f.action])
+                assert f.cost == there.wall.mean
+        said = text_of({**result, "chosen": {"look": result["chosen"]["look"]}})
+        assert (f"no action surely reaches R {target:g}" in said) == (not judged["meet_target"])
+        assert (f"(below R {target:g})" in said) == (0 < len(judged["meet_target"]) < 3)
+        sets.append(sorted(map(len, inside.values())))
+    assert sets[1] == [2, 2, 2]  # the targets tell regimes and actions apart
+    assert sets[2] not in (sets[1], sets[3])
+    assert sets[3] == [0, 0, 0]
+    one = comparisons(task, summary.estimates.tallies, "rough")["look"]
+    assert one.scenarios == ("regime=rough",)
+    assert all(f.admissible for f in one.figures), "in one regime the declared target rules nobody out"
+
+
+def test_a_cost_that_no_result_has_is_said(conduct: Conduct, tmp_path: Path) -> None:
+    """J is 1 - R then, which nobody would see."""
+    task = tmp_path / "fetch.toml"
+    task.write_text(TASK.read_text(encoding="utf-8").replace("value:force", "value:forse"), encoding="utf-8")
+    campaign = conduct("a", task=str(task), runs=24, digests={"task": digest(task), "services": digest(SERVICES)})
+    result = campaign.result()
+    assert result["judged"]["grip"]["uncosted"] == ["grip_soft"]
+    result["chosen"]["grip"]["grip_hard"] = 1  # primitive tasks without a choice are not printed
+    assert "grip_soft: no run reported value:forse" in text_of(result)
