@@ -134,7 +134,7 @@ class Campaign:
         """The result so far, as the command line writes it; the estimates file is written beside the table."""
         name = identity(self.plan)
         summary = Summary.of(self.bench.task, self.table.rows(), name, self.plan.options)
-        write_estimates(self.folder, summary.estimates, self.policy.selectors(), f"campaign/{name}")
+        write_estimates(self.folder, summary.estimates, self.policy.selectors(), name, summary.asked())
         return result_of(self.folder, self.plan, summary, self.policy.state())
 
     async def _results(self, pool: Pool, orders: Iterator[tuple[Block, dict[str, Any]]]) -> AsyncIterator[list[Row]]:

@@ -128,6 +128,10 @@ class Summary:
             actions[run.action] = actions.get(run.action, 0) + 1
         add_row(self.estimates, self.task, row, self.salt)
 
+    def asked(self) -> dict[str, Question]:
+        """By what the actions of each primitive task are judged."""
+        return {p.name: question_of(p, self.options) for p in self.task.primitive_tasks.values()}
+
     def comparisons(self) -> dict[str, Comparison]:
         """The actions of each primitive task judged over all regimes, as the campaign's options ask."""
         return comparisons(self.task, self.estimates.tallies, options=self.options)

@@ -131,10 +131,17 @@ class Learning:
         Over scenarios the target reliability is the one that was given, else the one that the task file declares.
         """
         tallies, primitive = self.estimates.of(primitive_task, context), self.task.primitive_tasks[primitive_task]
-        question = self.question(primitive_task)
-        if context is None and question.target is None:
-            question = replace(question, target=primitive.target_reliability)
+        question = self.question(primitive_task) if context is not None else self.asked()[primitive_task]
         return compare({a: tallies.get(a, {}) for a in primitive.alternatives}, question)
+
+    def asked(self) -> dict[str, Question]:
+        """By what the actions of each primitive task are judged over scenarios: the target given, else the declared one."""
+        found = {}
+        for name, primitive in self.task.primitive_tasks.items():
+            question = self.question(name)
+            declared = primitive.target_reliability if question.target is None else question.target
+            found[name] = replace(question, target=declared)
+        return found
 
     # --- state -----------------------------------------------------------------------------------------------------
 
