@@ -18,6 +18,8 @@ from coordinator.learning.sample import Sample, quantile
 from coordinator.task import Executed, Status
 
 CENSORED = "none"
+COUNT = "count"
+"""The measure, and the value of a result in which a run reports it."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -128,13 +130,19 @@ class Tally:
         return out
 
     def cost(self, measure: str = "wall") -> Moments:
-        """The cost by a measure: `wall`, `cpu`, `count` (each run costs 1) or `value:NAME`, over the counted runs."""
+        """The cost by a measure, over the counted runs: `wall`, `cpu` (s), `count` or `value:NAME`.
+
+        `count` is how many things a run used, as it reports in its value `count` (images averaged, tries); one that reports
+        none counts as 1.
+        """
         if measure == "wall":
             return self.wall
         if measure == "cpu":
             return self.cpu
-        if measure == "count":
-            return Moments(self.runs, 1.0, 0.0, 1.0, 1.0) if self.runs else EMPTY
+        if measure == COUNT:
+            said = self.values.get(COUNT, EMPTY)
+            silent = self.runs - said.n
+            return said.merged(Moments(silent, 1.0, 0.0, 1.0, 1.0)) if silent else said
         kind, _, name = measure.partition(":")
         if kind != "value" or not name:
             raise ValueError(f"{measure!r} is no cost measure: write wall, cpu, count or value:NAME")

@@ -14,7 +14,7 @@ import numpy as np
 from coordinator.learning.automata import DiscretisedPursuit, NikolicFu, RewardInaction
 from coordinator.learning.bandits import UCB1, Thompson
 from coordinator.learning.batch import SUMS, Batch, Mask, Trial
-from coordinator.learning.estimate import Observation, Tally
+from coordinator.learning.estimate import COUNT, Observation, Tally
 from coordinator.learning.objective import Question
 from coordinator.learning.rule import Rule
 from coordinator.learning.target import eligible
@@ -255,8 +255,8 @@ def cost_of(outcome: Observation, measure: str) -> float:
     """A run's cost by a measure; nan where it was not measured."""
     if measure == "wall":
         return outcome.seconds
-    if measure == "count":
-        return 1.0
+    if measure == COUNT:
+        return float(outcome.values.get(COUNT, 1.0))
     if measure == "cpu":
         return float("nan") if outcome.cpu_seconds is None else outcome.cpu_seconds
     return float(outcome.values.get(measure.removeprefix("value:"), float("nan")))

@@ -21,7 +21,9 @@ from coordinator.campaign.pool import LocalPool
 from coordinator.campaign.summary import Summary, comparisons, result_of
 from coordinator.campaign.table import TABLE, read_table
 from coordinator.campaign.worker import serve
+from coordinator.cli import main
 from coordinator.cli.campaign import text_of
+from coordinator.experience.estimates_file import EstimatesFile
 from coordinator.launch import Setting, lockstep_cell
 from coordinator.learning.objective import Question, compare
 from tests.campaign.conftest import SERVICES, TASK, Conduct
@@ -335,6 +337,49 @@ def test_j_is_made_with_the_target_and_rho_that_were_given(conduct: Conduct) -> 
     one = comparisons(task, summary.estimates.tallies, "rough")["look"]
     assert one.scenarios == ("regime=rough",)
     assert all(f.admissible for f in one.figures), "in one regime the declared target rules nobody out"
+
+
+COUNTING = """
+schema = 1
+[actions.look_quick]
+values = { hard = false }
+[actions.look_twice]
+values = { hard = false, count = 2 }
+[actions.look_long]
+values = { hard = false, count = 16 }
+[actions.grip_soft]
+values = { force = 1.0 }
+[actions.grip_hard]
+values = { force = 4.0 }
+"""
+
+
+def test_a_count_is_a_cost_in_campaigns_and_runs_alike(
+    conduct: Conduct, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Declared in the task file: how many images a run averaged, as it reports, 1 where it reports nothing."""
+    monkeypatch.chdir(tmp_path)
+    text = TASK.read_text(encoding="utf-8").replace('"look_long"]', '"look_long"]\ncost = "count"')
+    (task := tmp_path / "fetch.toml").write_text(text, encoding="utf-8")
+    (mock := tmp_path / "mock.toml").write_text(COUNTING, encoding="utf-8")
+    digests = {key: digest(path) for key, path in (("task", task), ("services", SERVICES), ("mock", mock))}
+    counted = {"look_quick": 1.0, "look_twice": 2.0, "look_long": 16.0}
+    campaign = conduct("a", task=str(task), mock=str(mock), digests=digests, selector="round_robin")
+    for row in campaign.table.rows():
+        assert row.throw is not None
+        assert row.throw.runs[0].cost == counted[row.throw.runs[0].action]
+    result = campaign.result()
+    assert result["judged"]["look"]["cost"] == "count"
+    assert result["J"]["look"] == {action: count / 16 for action, count in counted.items()}
+    told = ["run", str(task), "--services", str(SERVICES), "--mode", "lockstep", "--mock", str(mock), "--quiet"]
+    assert main([*told, "--runs", "6", "--learn", "run.db", "--selector", "round_robin"]) == 0
+    for path in (Path("run.db"), Path(result["estimates"])):
+        kept = EstimatesFile(path).read()
+        assert kept.question("look") == Question("count", 0.9)
+        for action, by_context in kept.estimates.of("look").items():
+            assert {tally.cost("count").mean for tally in by_context.values()} == {counted[action]}
+    learner = EstimatesFile(Path("run.db")).read().states("round_robin")["look"]["learners"]["regime=easy"]
+    assert learner["cost"] == [2 * count for count in counted.values()]
 
 
 def test_a_cost_that_no_result_has_is_said(conduct: Conduct, tmp_path: Path) -> None:

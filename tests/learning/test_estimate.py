@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from coordinator.learning.estimate import Observation, Tally, merge
 from coordinator.learning.intervals import clopper_pearson, wilson
 from coordinator.learning.moments import Moments
 from coordinator.learning.sample import SIZE, Sample, quantile
+from coordinator.learning.selectors import cost_of
 from coordinator.task import Executed, Status
 from tests.learning.conftest import COUNTED, OBSERVATIONS, tally_of
 
@@ -149,6 +151,17 @@ def test_cost_by_measure(measure: str, mean: float) -> None:
     assert tally_of(seen).cost(measure).mean == pytest.approx(mean)
     with pytest.raises(ValueError, match="no cost measure"):
         tally_of(seen).cost("pictures")
+
+
+@given(OBSERVATIONS, st.lists(st.none() | st.integers(0, 9), min_size=25, max_size=25))
+def test_a_count_is_what_runs_report_and_else_one(seen: list[Observation], counts: list[int | None]) -> None:
+    """Summed in a tally as the learners take it run by run; what was preempted and counts none has no cost."""
+    told = [replace(one, values={} if n is None else {"count": float(n)}) for one, n in zip(seen, counts, strict=False)]
+    counted = [one for one in told if one.status is not None and one.executed is not Executed.NO]
+    found = tally_of(told).cost("count")
+    assert found.n == len(counted)
+    assert found.total == pytest.approx(sum(cost_of(one, "count") for one in counted))
+    assert [cost_of(one, "count") for one in counted] == [one.values.get("count", 1.0) for one in counted]
 
 
 @given(st.integers(0, 60), st.integers(0, 60), st.sampled_from([0.8, 0.9, 0.95]))
