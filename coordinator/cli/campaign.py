@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
+from coordinator.cli.learning import no_less_than_nothing, reliability
 from coordinator.cli.loading import (
     add_services_argument,
     cell_path,
@@ -44,8 +45,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--learned", metavar="CAMPAIGN", type=Path, help="the best actions that this campaign has learned"
     )
-    parser.add_argument("--target", type=float, metavar="R", help="learn among actions that reach this reliability")
-    parser.add_argument("--rho", type=float, metavar="X", help="weight of cost when learning (1 / largest mean cost)")
+    parser.add_argument(
+        "--target", type=reliability, metavar="R", help="learn and judge by this reliability, not the declared one"
+    )
+    parser.add_argument(
+        "--rho", type=no_less_than_nothing, metavar="X", help="weight of cost in J (1 / largest mean cost)"
+    )
     parser.add_argument(
         "--workers", type=_positive, default=os.cpu_count() or 1, metavar="K", help="processes (%(default)s)"
     )

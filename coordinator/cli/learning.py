@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
 
 if TYPE_CHECKING:
-    import argparse
-
     from coordinator.experience.learning_session import LearningSession
     from coordinator.mission.partners import FirstAlternative
     from coordinator.task import Task
@@ -41,7 +41,7 @@ def add_learning_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--target",
-        type=_probability,
+        type=reliability,
         metavar="R",
         help="choose among actions that reach this reliability (with --learn)",
     )
@@ -56,13 +56,27 @@ def add_learning_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _probability(text: str) -> float:
-    import argparse
-
-    value = float(text)
+def reliability(text: str) -> float:
+    """A target reliability on the command line. Raises ArgumentTypeError."""
+    value = _number(text)
     if not 0 < value <= 1:
         raise argparse.ArgumentTypeError(f"{text} is no reliability: it must be above 0 and at most 1")
     return value
+
+
+def no_less_than_nothing(text: str) -> float:
+    """A weight or a cost on the command line: 0 or more, and finite. Raises ArgumentTypeError."""
+    value = _number(text)
+    if not 0 <= value < inf:
+        raise argparse.ArgumentTypeError(f"{text} is no weight or cost: it must be 0 or more, and finite")
+    return value
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError as fault:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number") from fault
 
 
 def opened(
