@@ -26,7 +26,7 @@ def show(kept: Kept, tasks: Sequence[str], options: argparse.Namespace) -> int:
     from coordinator.learning.objective import compare
 
     known = {task: kept.estimates.of(task, options.context) for task in tasks}
-    _refuse_unknown_context(kept, tasks, options)
+    refuse_unknown_context(kept, tasks, options)
     try:
         _refuse_unknown_cost(known, options)
         shown = {}
@@ -55,7 +55,8 @@ def _question(kept: Kept, task: str, options: argparse.Namespace) -> Question:
     )
 
 
-def _refuse_unknown_context(kept: Kept, tasks: Sequence[str], options: argparse.Namespace) -> None:
+def refuse_unknown_context(kept: Kept, tasks: Sequence[str], options: argparse.Namespace) -> None:
+    """Raise CommandError for a context in which no action of these primitive tasks was run."""
     if options.context is None:
         return
     known = {c for task in tasks for c in kept.estimates.contexts(task)}

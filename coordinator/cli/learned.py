@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coordinator.cli import CommandError
-from coordinator.cli.judged import show
+from coordinator.cli.judged import refuse_unknown_context, show
 from coordinator.cli.learning import no_less_than_nothing, reliability
 from coordinator.cli.propagated import show_task
 
@@ -25,7 +25,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "more", nargs="*", metavar="FILE|TASK", help="merge: files to take in; else: primitive tasks (all)"
     )
-    parser.add_argument("--context", metavar="TEXT", help="show: only this context (default: all, as scenarios)")
+    parser.add_argument(
+        "--context", metavar="TEXT", help="show, task: only this context (default: all; show takes them as scenarios)"
+    )
     parser.add_argument(
         "--cost",
         metavar="MEASURE",
@@ -59,6 +61,7 @@ def run(options: argparse.Namespace) -> int:
             raise CommandError(2, f"{options.file}: no such file; `petrobot run ... --learn {options.file}` makes it")
         kept = file.read()
         if options.verb == "task":
+            refuse_unknown_context(kept, _tasks(kept), options)
             return show_task(kept, options)
         _refuse_unknown(kept, options)
         if options.verb == "show":

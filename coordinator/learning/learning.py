@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -141,6 +142,17 @@ class Learning:
             question = self.question(name)
             declared = primitive.target_reliability if question.target is None else question.target
             found[name] = replace(question, target=declared)
+        return found
+
+    def uncosted(self) -> list[tuple[str, str, str]]:
+        """(primitive task, action, measure) of what was run in this session without ever having a cost by that measure."""
+        found = []
+        for name in self.task.primitive_tasks:
+            measure = self.question(name).measure
+            for action, by_context in self.gained.of(name).items():
+                whole = reduce(merge, by_context.values(), NOTHING)
+                if whole.runs and not whole.cost(measure).n:
+                    found.append((name, action, measure))
         return found
 
     # --- state -----------------------------------------------------------------------------------------------------

@@ -382,6 +382,37 @@ def test_a_count_is_a_cost_in_campaigns_and_runs_alike(
     assert learner["cost"] == [2 * count for count in counted.values()]
 
 
+@pytest.mark.parametrize("selector", ["random", "round_robin", "ucb1"])
+def test_learned_show_judges_as_the_campaign_did(
+    conduct: Conduct, selector: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the cost, the target and the rho that its estimates file holds, also if no selector learned by them."""
+    monkeypatch.chdir(tmp_path)
+    options = {"target": 0.6, "rho": 0.2}
+    result = conduct("a", selector=selector, runs=120, options=options).result()
+    assert main(["learned", "show", result["estimates"], "--json", "shown.json"]) == 0
+    shown = json.loads(Path("shown.json").read_text(encoding="utf-8"))["primitive_tasks"]
+    assert shown["grip"]["cost"] == "value:force"
+    for task, actions in result["J"].items():
+        about = shown[task]
+        found = {row["action"]: None if row["J"] is None else round(row["J"], 6) for row in about["actions"]}
+        assert found == actions
+        assert (about["target"], about["rho"]) == (0.6, 0.2)
+
+
+def test_a_damaged_estimates_file_says_that_it_can_be_made_again(conduct: Conduct) -> None:
+    """It is derived from the table; nobody's additions are wiped unasked."""
+    campaign = conduct("a")
+    path = Path(campaign.result()["estimates"])
+    whole = EstimatesFile(path).read().estimates
+    path.write_bytes(b"no database at all, but long enough to be looked at" * 9)
+    with pytest.raises(CampaignError, match=r"not a database.*If it is removed, the same command makes it again"):
+        campaign.result()
+    path.unlink()
+    campaign.result()
+    assert EstimatesFile(path).read().estimates == whole
+
+
 def test_a_cost_that_no_result_has_is_said(conduct: Conduct, tmp_path: Path) -> None:
     """J is 1 - R then, which nobody would see."""
     task = tmp_path / "fetch.toml"
