@@ -275,7 +275,9 @@ def _warnings(about: Mapping[str, Any]) -> list[str]:
         lines += [f"{action} does not surely reach R {about['target']:g} in any context: no J" for action in below]
     over = ", ".join(map(_named, about["judged_over"]))
     if not over and len(run) > 1:
-        lines.append("there is no context in which all actions were run: each is judged in its own, the order says little")
+        lines.append(
+            "there is no context in which all actions were run: each is judged in its own, the order says little"
+        )
     elif over and len(about["judged_over"]) < len(about["contexts"]):
         lines.append(f"judged over the contexts in which all actions were run: {over}")
     for action in about["uncosted"]:
