@@ -137,14 +137,14 @@ class Summary:
         return comparisons(self.task, self.estimates.tallies, options=self.options)
 
     def _judged(self, name: str, found: Comparison) -> dict[str, Any]:
-        """What J of a primitive task was made with: measure, target, rho, regimes, actions that meet the target."""
+        """What J of a primitive task was made with: measure, target, rho, regimes, who meets the target where."""
         asked = question_of(self.task.primitive_tasks[name], self.options)
         return {
             "cost": asked.measure,
             "target": asked.target,
             "rho": round(found.rho, 9),
             "regimes": [regime_of(s) for s in found.scenarios],
-            "meet_target": [f.action for f in found.figures if f.admissible],
+            "meet_target": {f.action: [regime_of(s) for s in f.scenarios] for f in found.figures if f.admissible},
             "uncosted": list(found.uncosted),
         }
 

@@ -292,9 +292,10 @@ def _warnings(about: Mapping[str, Any]) -> list[str]:
 def _remarks(about: Mapping[str, Any], options: argparse.Namespace) -> list[str]:
     lines = []
     for row in about["actions"]:
-        if options.target is not None:
+        if options.target is not None or (row["scenarios"] and about["target"] is not None):
             met = ", ".join(map(_named, row["scenarios"])) or "none"
-            lines.append(f"{row['action']} meets R {options.target:g} in: {met}")
+            most = f", where it costs {_cell(row['C_largest'])} at most" if row["scenarios"] else ""
+            lines.append(f"{row['action']} meets R {about['target']:g} in: {met}{most}")
         if row["causes"]:
             lines.append(f"{row['action']}: " + ", ".join(f"{n} {cause}" for cause, n in row["causes"].items()))
     lines += [

@@ -212,7 +212,8 @@ def _said(fault: Exception) -> str:
 def state_of(body: str) -> dict[str, Any]:
     """A selector's state. Raises KeyError, TypeError or ValueError if it is none."""
     state: dict[str, Any] = json.loads(body)
-    trials(state)
+    if not 0 <= trials(state) < inf:  # it would win, or lose, every merge
+        raise ValueError(f"a selector that has learned from {trials(state):g} trials")
     return state
 
 

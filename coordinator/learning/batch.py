@@ -168,6 +168,8 @@ class Batch:
         if abs(self.p[0].sum() - 1) > 1e-6:
             raise ValueError("probabilities that do not sum to 1")
         self.k[0] = float(data["k"])
+        if not 0 <= self.k[0] < np.inf:
+            raise ValueError(f"{data['k']!r} trials")
         for name, array in self.own.items():
             values = np.asarray(data["own"][name], dtype=float)
             if values.shape != array.shape[1:]:

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from coordinator.campaign.conduct import Campaign, Progress
+from coordinator.campaign.observed import regime_of
 from coordinator.campaign.plan import MANIFEST, CampaignError, Plan, digest, read_manifest, write_manifest
 from coordinator.campaign.pool import LocalPool
 from coordinator.campaign.summary import Summary, comparisons, result_of
@@ -320,7 +321,7 @@ def test_j_is_made_with_the_target_and_rho_that_were_given(conduct: Conduct) -> 
         assert judged["rho"] == pytest.approx(expected.rho)
         assert result["J"]["look"] == {f.action: round(f.j, 6) if isfinite(f.j) else None for f in expected.figures}
         inside = {a: [c for c, t in by.items() if t.interval()[0] >= target] for a, by in tallies.items()}
-        assert judged["meet_target"] == [a for a in task.primitive_tasks["look"].alternatives if inside[a]]
+        assert judged["meet_target"] == {a: list(map(regime_of, met)) for a, met in inside.items() if met}
         for f in expected.figures:
             assert f.reliability == min(tally.reliability for tally in tallies[f.action].values())
             if f.scenario is not None:

@@ -194,7 +194,13 @@ def test_a_damaged_selector_is_not_taken_in(tmp_path: Path) -> None:
     """One clear error, and the file that should have taken it is as it was."""
     one, other = file_of(tmp_path / "one.db", 2), EstimatesFile(tmp_path / "other.db")
     other.add(Estimates(), {"pick": state_of("ucb1", {"A": 3})})
-    for body in ("torn", "[]", '{"learners": {"A": {}}}'):
+    for body in (
+        "torn",
+        "[]",
+        '{"learners": {"A": {}}}',
+        '{"learners": {"A": {"k": -5}}}',
+        '{"learners": {"A": {"k": NaN}}}',
+    ):
         written(other.path, f"UPDATE selector SET state = '{body}'")
         with pytest.raises(EstimatesError, match="do not fit"):
             one.merge(other.path)

@@ -259,6 +259,7 @@ def test_shown_by_the_target_that_the_file_holds(tmp_path: Path, capsys: pytest.
     assert (row["scenario"], row["scenarios"], row["C"], row["worst"]) == ("windy", ["calm", "windy"], 2.0, "storm")
     assert row["J"] == pytest.approx(1 - 0.5 + 0.25 * 2.0)
     assert weak["J"] is None
+    assert "act meets R 0.85 in: calm, windy, where it costs 2 at most" in text
     assert "target R 0.85" in text and "weak does not surely reach R 0.85 in any context: no J" in text
     shown, text = told(path, capsys, "--target", "0.995", "--rho", "0")
     assert shown["pick"]["target_unmet"]
