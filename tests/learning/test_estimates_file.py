@@ -536,24 +536,40 @@ def test_merging_from_nowhere_is_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "one.db").exists()
 
 
-@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(steps=st.lists(st.tuples(st.integers(0, 2), st.sampled_from("amM"), st.integers(1, 3)), max_size=12))
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(steps=st.lists(st.tuples(st.integers(0, 2), st.sampled_from("amMc"), st.integers(1, 3)), max_size=12))
 def test_files_that_met_agree(steps: list[tuple[int, str, int]], tmp_path: Path) -> None:
-    """Whatever was added where and merged whither: after all have met, all know every run exactly once."""
+    """Whatever was added where and merged whither, one file begun under schema 1, one by a campaign, campaigns given again
+    anywhere: after all have met, all know every run exactly once."""
     folder = tmp_path / "crdt"
     for old in folder.glob("*") if folder.exists() else ():
         old.unlink()
-    files = [EstimatesFile(folder / f"{i}.db", f"origin{i}") for i in range(3)]
-    added = 3
-    for i, file in enumerate(files):
-        file.add(gained(1, salt=f"begin{i}"), {})
+    folder.mkdir(exist_ok=True)
+
+    def campaign(number: int, file: EstimatesFile) -> None:
+        """Each is of 10 more runs than the one before; it may stand in several files."""
+        runs = gained(10 * number, salt=f"campaign{number}")
+        file.put_closed(f"campaign/{number}", runs, {}, {"pick": Question("cpu", 0.1 * number)})
+        campaigns.add(number)
+
+    campaigns: set[int] = set()
+    files = [
+        old_file(folder / "0.db", 1, "origin0"),
+        *(EstimatesFile(folder / f"{i}.db", name) for i, name in ((1, "campaign/1"), (2, "origin2"))),
+    ]
+    campaign(1, files[1])
+    files[2].add(gained(1, salt="begin"), {})
+    added = 2
     for number, (i, what, n) in enumerate(steps):
         if what == "a":
             files[i].add(gained(n, salt=str(number)), {})
             added += n
+        elif what == "c":
+            campaign(n, files[i])
         else:
             files[i].merge(files[(i + n) % 3].path)
     for _ in range(2):
         for i in range(3):
             files[i].merge(files[(i + 1) % 3].path)
-    assert {f.read().estimates.tally(KEY).runs for f in files} == {added}
+    assert {f.read().estimates.tally(KEY).runs for f in files} == {added + 10 * sum(campaigns)}
+    assert len({frozenset(f.read().asked.get("pick", ())) for f in files}) == 1
