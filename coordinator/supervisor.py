@@ -39,6 +39,8 @@ class _Child:
     log: Path
     ready: asyncio.Event = field(default_factory=asyncio.Event)
     process: asyncio.subprocess.Process | None = None
+    begun_at: int = 0
+    """Where the newest start begins in the log (bytes)."""
     starts: int = 0
     task: asyncio.Task[None] | None = None
 
@@ -138,7 +140,8 @@ class Supervisor:
         if ready in done:
             return
         ready.cancel()
-        tail = "\n".join(child.log.read_text(errors="replace").splitlines()[-12:]) if child.log.exists() else ""
+        said = child.log.read_bytes()[child.begun_at :] if child.log.exists() else b""
+        tail = "\n".join(said.decode(errors="replace").splitlines()[-12:])
         why = "ended" if child.task in done else f"was not ready after {timeout:g} s"
         raise LaunchError(f"node {child.program.name} {why}; its log {child.log} ends with:\n{tail}")
 
@@ -157,6 +160,7 @@ class Supervisor:
 
     async def _run_once(self, child: _Child) -> None:
         with child.log.open("ab") as log:
+            child.begun_at = log.seek(0, os.SEEK_END)
             process = await asyncio.create_subprocess_exec(
                 *child.program.command,
                 stdin=asyncio.subprocess.DEVNULL,

@@ -259,6 +259,8 @@ class Node:
                 data: dict[str, Any] = {"answers": answers, "devices": command.data}
                 if command.note:
                     data["note"] = command.note
+                if command.verb == "status":
+                    data["emergency"] = list(self.stopped_in_emergency())
                 self.callee.answer(now, id_, held and not command.missing, data)
 
     # --- reports of places -------------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from services.comm.client import Client
 from services.comm.credentials import credentials
 from services.comm.directory import Directory, DirectoryError
 from services.comm.latch import STATE, latch_of
+from services.comm.listening import listening, refuse_unusable
 from services.comm.notice import Notice
 from services.comm.parentage import GOOD_ORDER, outlive, wanted_with_parent
 from services.comm.security import require_key
@@ -83,15 +84,18 @@ class NodeShell:
     # --- life --------------------------------------------------------------------------------------------------------
 
     async def start(self) -> None:
-        """Bring the devices up, then listen. Raises DirectoryError when a device cannot be started, OSError, KeyNeededError."""
+        """Bring the devices up, then listen. Raises DirectoryError when a device cannot be started or the address cannot be had,
+        KeyNeededError."""
         host, port = self._directory.address(self._name)
         require_key(self._name, host, self._credentials.guarded)
+        refuse_unusable(self._directory, self._name)
         try:
             for place in self._workers.values():
                 place.start()
             async with asyncio.timeout(START_LIMIT):
                 await self._until_ready()
-            await self.server.start(host, port)
+            with listening(self._directory, self._name):
+                await self.server.start(host, port)
             self._serving = True
         except TimeoutError:
             await self.close()

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from services.comm.directory import Directory, DirectoryError, load, resolve
+from services.comm.durations import not_negative
 from services.comm.lockstep import CellError
 from services.comm.lockstep_process import run_member
 from services.comm.security import KeyFileError, KeyNeededError
@@ -30,7 +31,7 @@ def parser() -> argparse.ArgumentParser:
     commands.add_argument("--lockstep", action="store_true", help="be a member of a lock-step cell")
     commands.add_argument(
         "--await-coordinator",
-        type=float,
+        type=not_negative,
         default=0.0,
         metavar="S",
         help="lock step: wait so long for a coordinator that died and is resumed (s of wall time)",

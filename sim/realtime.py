@@ -20,7 +20,7 @@ import secrets
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from typing import Final
 
@@ -29,6 +29,7 @@ from services.comm.camera import ImageServer
 from services.comm.can_hub import Hub
 from services.comm.credentials import credentials
 from services.comm.directory import Directory, resolve
+from services.comm.listening import listening, refuse_unusable
 from services.comm.messages import Call, Outcome
 from services.comm.party import TICK
 from services.comm.server import Server
@@ -136,14 +137,16 @@ class LaboratoryShell:
     """A running laboratory of one simulated node of services.toml. Between `start` and `close` it serves."""
 
     def __init__(self, directory: Directory, name: str) -> None:
-        """Raises LaboratoryError, ImportError for a `sim` that is not there, ValueError for an address that cannot be, OSError
-        for one that is taken."""
+        """Raises LaboratoryError, ImportError for a `sim` that is not there, ValueError for an address that cannot
+        be."""
         self._directory = directory
         self._name = name
         self.laboratory = _made(directory, name)
         channel, address = bus_channel(directory), camera_address(directory)
-        self._hub = Hub(channel) if channel else None
-        self._images = ImageServer(*address) if address else None
+        with _had(f"{directory.source}: the simulated bus's channel {channel}"):
+            self._hub = Hub(channel) if channel else None
+        with _had(f"{directory.source}: the simulated camera's address {':'.join(map(str, address or ()))}"):
+            self._images = ImageServer(*address) if address else None
         self.pacemaker = Pacemaker(self.laboratory, self._hub, self._images)
         offers = {
             service: Offer(inline=None if service == self.laboratory.between_ticks else self._answer)
@@ -160,7 +163,7 @@ class LaboratoryShell:
         self._fault: BaseException | None = None
 
     async def start(self) -> None:
-        """Make all ready that takes long, start the world's clock, then listen. Raises OSError, KeyNeededError."""
+        """Make all ready that takes long, start the world's clock, then listen. Raises DirectoryError, KeyNeededError."""
         if self._images is not None:
             self.laboratory.make_ready({})
         gc.collect()
@@ -168,7 +171,8 @@ class LaboratoryShell:
         self._loop = asyncio.get_running_loop()
         self._thread.start()
         try:
-            await self.server.start(*self._directory.address(self._name))
+            with listening(self._directory, self._name):
+                await self.server.start(*self._directory.address(self._name))
         except BaseException:
             await self.close()
             raise
@@ -230,6 +234,16 @@ def _made(directory: Directory, name: str) -> LaboratoryParty:
     return made
 
 
+@contextlib.contextmanager
+def _had(what: str) -> Iterator[None]:
+    """Raises LaboratoryError in place of OSError: whoever reads it knows no errno."""
+    try:
+        yield
+    except OSError as fault:
+        why = os.strerror(fault.errno) if fault.errno else str(fault)
+        raise LaboratoryError(f"{what}: {why}; end the process that listens there, or give another port") from fault
+
+
 def bus_channel(directory: Directory) -> str:
     """Channel of the simulated bus: that of the device that speaks `petrobot_stream`; empty without one."""
     channels = set()
@@ -261,6 +275,7 @@ def camera_address(directory: Directory) -> tuple[str, int] | None:
 
 async def serve(directory: Directory, name: str) -> None:
     """Run the laboratory until SIGTERM or SIGINT; prints one line with `ready` when it serves."""
+    refuse_unusable(directory, name)  # a second laboratory is told of its node's address, not of its bus's
     shell = LaboratoryShell(directory, name)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):

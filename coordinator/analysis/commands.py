@@ -99,7 +99,9 @@ def _view(model: Task | NetFile, rates: Path | str | None) -> str:
 
 
 def _named(path: Path, error: Exception) -> str:
-    return str(error) if isinstance(error, FormatError) else f"{path}: {error}"
+    """What is wrong, with the file's name once: readers of files name it themselves."""
+    told = str(error)
+    return told if isinstance(error, FormatError) or told.startswith(f"{path}:") else f"{path}: {told}"
 
 
 def _tokens_of(net: Net, changes: Sequence[Change]) -> list[Change]:
@@ -142,6 +144,9 @@ def _compared(now: Analysis, then: Analysis) -> list[str]:
 def _subject(model: Task | NetFile, rates: Path | str | None, view: str) -> tuple[Subject, str, tuple[str, ...]]:
     """(what to analyse, its name, notes)."""
     if isinstance(model, Task):
+        if rates is not None:
+            remedy = "leave it out: a task's times are its `estimates` and `mean_wait`, and --what-if changes them"
+            raise FormatError("--rates", str(rates), f"{model.name} is a task; rates are for net files", remedy)
         return model, model.name, ()
     if rates == "unit":
         return unit_rates(model), model.name, (*model.notes, "every transition has the rate 1/s")
@@ -180,6 +185,7 @@ def simulate_command(
     try:
         model, wanted = open_model(path, load_task), [read_change(text) for text in changes]
         if isinstance(model, Task):
+            _subject(model, rates, "gspn")  # refuses rates
             model, measured = change_task(model, Measured(), wanted)
             view = stochastic_view(model, measured, stages=stages, timer_stages=stages)
             ends = OrdinaryView(model)
@@ -239,7 +245,7 @@ def convert_command(source: Path, target: Path, load_task: LoadTask, *, stages: 
             model, lost = _exported(model, target, stages)
         else:
             lost = list(model.notes)
-        text, more = written(model, target.suffix)
+        text, more = written(model, target)
         target.write_text(text, encoding="utf-8")
     except (FormatError, NoEstimate, ValueError, OverflowError) as error:
         return Outcome(BAD_INPUT, _named(source, error), {"error": _named(source, error)})

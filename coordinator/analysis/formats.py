@@ -41,9 +41,9 @@ def _utf8(text: bytes, file: str) -> str:
         raise FormatError(file, "file", str(error), "give a UTF-8 file") from error
 
 
-def written(model: NetFile, ending: str) -> tuple[str, list[str]]:
-    """(text of the net in the format of an ending, what that format does not keep). Raises FormatError."""
-    match ending.lower():
+def written(model: NetFile, target: Path) -> tuple[str, list[str]]:
+    """(text of the net in the format of the target's ending, what that format does not keep). Raises FormatError."""
+    match target.suffix.lower():
         case ".pnml":
             return pnml_writing.write_pnml(model), pnml_writing.losses(model)
         case ".net":
@@ -52,6 +52,7 @@ def written(model: NetFile, ending: str) -> tuple[str, list[str]]:
             return dot.write_dot(model), ["a drawing: priorities, capacities and rates"]
         case ".drn":
             if model.gspn is None:
-                raise FormatError("drn", "rates", "the net has none", "give rates: a CTMC needs them")
+                raise FormatError(str(target), "rates", "the net has none", "give rates: a CTMC needs them")
             return storm.write_drn(Chain.of(model.gspn)), ["the net itself: only its chain is written"]
-    raise FormatError(ending, "file", "no writer for this ending", f"known are {', '.join(WRITE)}")
+    ending = f"the ending {target.suffix}" if target.suffix else "a file without ending"
+    raise FormatError(str(target), "file", f"no writer for {ending}", f"end its name in {', '.join(WRITE)}")

@@ -235,6 +235,7 @@ def analyse(
 
 LOOK = 10_000
 """Markings after which a net is asked whether it can grow without end, before it is searched to its limits."""
+ENDLESS = "it has no end: the net is unbounded"
 CUT = "Ctrl-C: a partial answer, what had been found by then"
 
 
@@ -248,9 +249,9 @@ def _search(net: Net, limits: Limits | None, engine: EngineName) -> tuple[Space,
         proven = place_bounds(net)
         cover = settle_bounds(net, proven) if None in proven else None
         if cover is not None and cover.bounded is False:
-            return replace(first, reason="it has no end: the net is unbounded"), cover
+            return replace(first, reason=ENDLESS), cover
         if cover is not None and cover.bounded is None and find_pump(first) is not None:
-            return replace(first, reason="it has no end: the net is unbounded"), cover
+            return replace(first, reason=ENDLESS), cover
     return explore(net, limits=limits, engine=engine), None
 
 

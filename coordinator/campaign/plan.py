@@ -150,10 +150,14 @@ def read_manifest(folder: Path) -> Plan:
         if not isinstance(data, Mapping):
             raise ValueError(f"a {type(data).__name__} is no plan")
         return Plan.from_plain(data)
-    except FileNotFoundError as fault:
-        raise CampaignError(f"{folder} holds no campaign: {MANIFEST} is missing") from fault
-    except (OSError, ValueError, TypeError, KeyError) as fault:
-        raise CampaignError(f"{path} is empty, torn or no plan of a campaign ({fault}); {_remedy(folder)}") from fault
+    except (FileNotFoundError, NotADirectoryError) as fault:
+        remedy = "give a folder that `petrobot campaign --out FOLDER` wrote"
+        raise CampaignError(f"{folder} holds no campaign: {MANIFEST} is missing; {remedy}") from fault
+    except OSError as fault:
+        raise CampaignError(f"{path}: {fault.strerror or fault}") from fault
+    except (KeyError, ValueError, TypeError, AttributeError) as fault:
+        said = f"the key {fault} is missing" if isinstance(fault, KeyError) else str(fault)
+        raise CampaignError(f"{path}: {said}; it is empty, torn or no plan: {_remedy(folder)}") from fault
 
 
 def _remedy(folder: Path) -> str:

@@ -242,10 +242,16 @@ def learned_choices(folder: Path) -> dict[str, dict[str, str]]:
     path = folder / "result.json"
     try:
         result = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as fault:
-        raise CampaignError(f"{path}: no finished campaign: {fault}") from fault
-    if result.get("selector") in PLAIN:
-        raise CampaignError(f"{folder}: the selector {result['selector']} has learned nothing; give one that learns")
-    return {
-        regime: {task: known["best"] for task, known in tasks.items()} for regime, tasks in result["policy"].items()
-    }
+    except OSError as fault:
+        remedy = "give the folder of a campaign that has ended, as `petrobot campaign --out FOLDER` leaves it"
+        raise CampaignError(f"{path}: no finished campaign: {fault.strerror or fault}; {remedy}") from fault
+    except ValueError as fault:
+        raise CampaignError(f"{path}: no finished campaign: it is no JSON ({fault})") from fault
+    try:
+        if result["selector"] in PLAIN:
+            raise CampaignError(
+                f"{folder}: the selector {result['selector']} has learned nothing; give one that learns"
+            )
+        return {regime: {t: known["best"] for t, known in tasks.items()} for regime, tasks in result["policy"].items()}
+    except (KeyError, TypeError, AttributeError) as fault:
+        raise CampaignError(f"{path}: no result of a campaign: selector and policy are missing") from fault

@@ -9,7 +9,7 @@ from coordinator.check.conflicts import conflicts
 from coordinator.check.events import event_faults, external_waits
 from coordinator.check.findings import Finding, Report
 from coordinator.check.flow import never_marked, odd_ends, timeless_cycles, unused
-from coordinator.check.offers import unoffered
+from coordinator.check.offers import translating_others, unoffered
 from coordinator.conditions.wording import Severity
 from coordinator.task import Task
 from coordinator.task.consistency import faults
@@ -29,12 +29,24 @@ _CHECKS: tuple[Callable[[Task], Iterator[Finding]], ...] = (
 _ORDER = (Severity.ERROR, Severity.WARNING, Severity.NOTE)
 
 
-def check(task: Task, offers: Mapping[str, str] | None = None) -> Report:
-    """Everything that can be said of the task without exploring it. `offers`: the node of each action that is offered."""
+def check(
+    task: Task,
+    offers: Mapping[str, str] | None = None,
+    *,
+    translates: Mapping[str, str] | None = None,
+    source: str = "services.toml",
+) -> Report:
+    """Everything that can be said of the task without exploring it.
+
+    `offers`: the node of each action that is offered; `translates`: the primitive task that each of them is said to
+    translate; `source`: the location file that says so.
+    """
     broken = faults(task)
     if broken:
         return Report(tuple(Finding(Severity.ERROR, "inconsistent", f.key, f.text, f.remedy) for f in broken))
     found = [finding for part in _CHECKS for finding in part(task.flat)]
     if offers is not None:
-        found += unoffered(task, offers)
+        found += unoffered(task, offers, source)
+    if translates is not None:
+        found += translating_others(task, translates, source)
     return Report(tuple(sorted(found, key=lambda f: _ORDER.index(f.severity))))

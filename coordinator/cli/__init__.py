@@ -9,8 +9,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 EXIT_CODES = """\
-exit codes: 0 the task reached its final marking (or the command did its work), 1 it ended in ERROR or was aborted,
-            2 bad input, 3 a node is unreachable, 130 interrupted"""
+exit codes: 0 the task reached its final marking (or the command did its work, and its answer is yes),
+            1 the task ended in ERROR or was aborted; or the answer is no: analyse refuses a verdict or does not know it,
+              simulate was cut short, forecast disagrees, replay differs, a running task refuses an operator's command,
+            2 bad input (check: the task may not run), 3 a node is unreachable, 130 interrupted"""
 
 
 class CommandError(Exception):

@@ -10,7 +10,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from coordinator.cli import CommandError
 from coordinator.cli.loading import task_path, write_json
+from coordinator.cli.quantities import number, whole
 
 if TYPE_CHECKING:
     from coordinator.analysis.commands import Outcome
@@ -34,16 +36,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="rates of transitions (TOML: `[rates]` and `ID = PER_SECOND` below it), or the word unit for 1/s each",
     )
     parser.add_argument(
-        "--states", type=int, default=5_000_000, metavar="N", help="most markings (default: %(default)s)"
+        "--states", type=whole(), default=5_000_000, metavar="N", help="most markings (default: %(default)s)"
     )
     parser.add_argument(
         "--seconds",
-        type=float,
+        type=number(least=0.0),
         default=60.0,
         metavar="S",
         help="longest search of a state space, 0 for no limit; what was found by then is told (default: %(default)g)",
     )
-    parser.add_argument("--memory", type=int, default=2048, metavar="MIB", help="most memory (default: %(default)s)")
+    parser.add_argument(
+        "--memory", type=whole(), default=2048, metavar="MIB", help="most memory (default: %(default)s)"
+    )
     parser.add_argument(
         *("--what-if", "-w"),
         action="append",
@@ -111,9 +115,13 @@ def progress_of_search(limits: Limits) -> Iterator[Limits]:
 
 
 def give(outcome: Outcome, json_file: str | None) -> int:
-    """Print and write what an analysis command found; gives its exit code."""
+    """Print and write what an analysis command found; gives its exit code. Raises CommandError for bad input."""
+    from coordinator.analysis.commands import BAD_INPUT
+
     if json_file:
         write_json(json_file, outcome.data)
+    if outcome.code == BAD_INPUT:
+        raise CommandError(BAD_INPUT, outcome.text)
     if json_file != "-":
         print(outcome.text)
     return outcome.code

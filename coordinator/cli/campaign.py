@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
-from coordinator.cli.learning import no_less_than_nothing, reliability
 from coordinator.cli.loading import (
     add_services_argument,
     cell_path,
@@ -20,6 +19,7 @@ from coordinator.cli.loading import (
     task_path,
     write_json,
 )
+from coordinator.cli.quantities import number, probability, whole
 
 if TYPE_CHECKING:
     from coordinator.campaign.conduct import Campaign
@@ -32,9 +32,7 @@ EXAMPLE = "petrobot campaign catch_ball --runs 200 --regime A,B --selector nikol
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument("task", nargs="?", help="a task file, or the name of a task that comes with petrobot")
-    parser.add_argument(
-        "--runs", type=_positive, default=100, metavar="N", help="in all regimes together (%(default)s)"
-    )
+    parser.add_argument("--runs", type=whole(), default=100, metavar="N", help="in all regimes together (%(default)s)")
     parser.add_argument(
         "--regime", default="", metavar="A,B", help="regimes that take turns, with the same seeds in each"
     )
@@ -46,25 +44,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--learned", metavar="CAMPAIGN", type=Path, help="the best actions that this campaign has learned"
     )
     parser.add_argument(
-        "--target", type=reliability, metavar="R", help="learn and judge by this reliability, not the declared one"
+        "--target", type=probability, metavar="R", help="learn and judge by this reliability, not the declared one"
     )
     parser.add_argument(
-        "--rho", type=no_less_than_nothing, metavar="X", help="weight of cost in J (1 / largest mean cost)"
+        "--rho", type=number(least=0.0), metavar="X", help="weight of cost in J (1 / largest mean cost)"
     )
     parser.add_argument(
-        "--workers", type=_positive, default=os.cpu_count() or 1, metavar="K", help="processes (%(default)s)"
+        "--workers", type=whole(), default=os.cpu_count() or 1, metavar="K", help="processes (%(default)s)"
     )
     parser.add_argument(
         "--cluster", metavar="ADDRESS", help="workers of this dask scheduler instead, as tcp://host:8786"
     )
-    parser.add_argument("--seed", type=int, default=1, metavar="S", help="of all chance (%(default)s)")
+    parser.add_argument("--seed", type=whole(0), default=1, metavar="S", help="of all chance (%(default)s)")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the task")
     parser.add_argument(
-        "--block", type=_positive, metavar="N", help="runs in one cell (as many as the task's runs place holds)"
+        "--block", type=whole(), metavar="N", help="runs in one cell (as many as the task's runs place holds)"
     )
     parser.add_argument(
         "--batch",
-        type=_positive,
+        type=whole(),
         default=20,
         metavar="N",
         help="runs between two updates of what is learned (%(default)s)",
@@ -158,6 +156,7 @@ def _print_check(check: dict[str, Any] | None) -> None:
 
 def _refuse_unfit(task: Task, options: argparse.Namespace) -> None:
     from coordinator.check import check
+    from coordinator.cli.lockstep import substitutes
 
     directory = load_directory(options.services)
     report = check(task, {action: entry.node for action, entry in directory.actions.items()})
@@ -165,6 +164,7 @@ def _refuse_unfit(task: Task, options: argparse.Namespace) -> None:
     if faults:
         lines = "\n".join(f"  {f.key}: {f.text}\n    {f.remedy}" for f in faults)
         raise CommandError(2, f"{task.name} may not run with {directory.source}:\n{lines}")
+    substitutes(options.mock, directory)  # refuses a script for actions that there are not
     if not options.cluster:
         refuse_misplaced(directory, everywhere=True, scripted=options.mock is not None)
 
@@ -181,20 +181,11 @@ async def _conduct(campaign: Campaign, options: argparse.Namespace) -> None:
             await campaign.run(pool)
 
 
-def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not at least 1")
-    return value
-
-
 def _plan(options: argparse.Namespace, task: Task) -> Plan:
     from coordinator.campaign.plan import Plan, digest
     from coordinator.campaign.policies import learns
     from coordinator.cli.parameters import parameter_of
 
-    if options.seed < 0:
-        raise CommandError(2, f"--seed {options.seed}: give 0 or more")
     given = dict(_pair("--set", text) for text in options.set)
     regimes = tuple(name for name in options.regime.split(",") if name) or (str(task.parameters.get("regime", "")),)
     if regimes != ("",) and "regime" not in task.parameters:

@@ -8,11 +8,13 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from coordinator.cli.loading import (
+    SHIPPED_CELL,
     add_services_argument,
     cell_path,
     load_directory,
     load_task,
     refuse_misplaced,
+    task_path,
     write_json,
 )
 
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
     from coordinator.task import Task
 
 EXAMPLE = "petrobot check catch_ball"
+NO_CELL = "no-cell"
+"""Code of the finding about the location file that was not given."""
 PATIENCE = 2.0
 """Seconds that a node has to answer."""
 MOST_STATES, LONGEST, MOST_MEMORY = 200_000, 5.0, 500_000_000
@@ -42,16 +46,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Check; 0 when the task may run, 2 when it may not, 3 when only a node that it needs is missing."""
-    from coordinator.check import check
-
     task = load_task(options.task)
-    offers: dict[str, str] | None = None
     services = cell_path(options.services, options.task, task)
-    if options.services is not None or services.exists():
-        directory = load_directory(services)
-        refuse_misplaced(directory)
-        offers = {action: directory.where(action) for action in directory.actions}
-    report = check(task, offers)
+    report = _checked(task, services)
     missing = _missing(task, services) if options.live else []
     broken = any(finding.code == "inconsistent" for finding in report.errors)
     analysis = None if broken else _analysed(task)
@@ -59,14 +56,40 @@ def run(options: argparse.Namespace) -> int:
     live = {"live": missing} if options.live else {}
     if options.json:
         found = {} if analysis is None else _plain_analysis(analysis)
-        write_json(options.json, {"task": task.name, "ok": ok, "findings": _plain(report), **found, **live})
+        findings = _plain(report, options.task)
+        write_json(options.json, {"task": task.name, "ok": ok, "findings": findings, **found, **live})
     if options.json != "-":
-        print(
-            "\n".join(
-                [*(f"missing {line}" for line in missing), _text(options.task, report, analysis, ok and not missing)]
-            )
-        )
+        told = [f"missing {line}" for line in missing] + _told(report, options.task)
+        print("\n".join([*told, _text(options.task, analysis, ok and not missing)]))
     return 2 if not ok else 130 if analysis is not None and analysis.interrupted else 3 if missing else 0
+
+
+def _checked(task: Task, services: Path) -> Report:
+    """What is to be said of the task, and of the actions that a location file offers it."""
+    from coordinator.check import check
+
+    if services == SHIPPED_CELL and not services.exists():
+        said = "there is none here, and none came with petrobot: whether nodes offer the actions was not checked"
+        return _noted(check(task), said)
+    directory = load_directory(services)
+    refuse_misplaced(directory)
+    report = check(
+        task,
+        {action: entry.node for action, entry in directory.actions.items()},
+        translates={action: entry.task for action, entry in directory.actions.items()},
+        source=str(services),
+    )
+    if services == SHIPPED_CELL and any(finding.code == "unoffered" for finding in report.findings):
+        return _noted(report, f"there is none here, so {services} was used, which comes with petrobot")
+    return report
+
+
+def _noted(report: Report, said: str) -> Report:
+    """The findings with a note about the location file that was not given."""
+    from coordinator.check import Finding, Report, Severity
+
+    remedy = "write one of your own, or give --services FILE"
+    return Report((*report.findings, Finding(Severity.NOTE, NO_CELL, "services.toml", said, remedy)))
 
 
 def _missing(task: Task, services: Path | None) -> list[str]:
@@ -106,32 +129,56 @@ def _plain_analysis(analysis: Analysis) -> dict[str, Any]:
     return {"complete": data["complete"], "objections": objections, "analysis": data}
 
 
-def _plain(report: Report) -> list[dict[str, str]]:
+def _plain(report: Report, name: str) -> list[dict[str, Any]]:
     fields = ("severity", "key", "text", "remedy")
-    return [{field: str(getattr(finding, field)) for field in fields} for finding in report.findings]
-
-
-def _text(name: str, report: Report, analysis: Analysis | None, ok: bool) -> str:
-    ended = ""
-    lines = [
-        f"{f.severity:8}{f.key}: {f.text}" + (f"\n        {f.remedy}" if f.remedy else "") for f in report.findings
+    return [
+        {**{field: str(getattr(finding, field)) for field in fields}, "line": line}
+        for finding, line in zip(report.findings, _lines(report, name), strict=True)
     ]
+
+
+def _told(report: Report, name: str) -> list[str]:
+    """The findings for people, each with the place in the task file that it is about."""
+    path = task_path(name)
+    places = [f"{path}:{line}: " if line else "" for line in _lines(report, name)]
+    return [
+        f"{f.severity:8}{place}{f.key}: {f.text}" + (f"\n        {f.remedy}" if f.remedy else "")
+        for f, place in zip(report.findings, places, strict=True)
+    ]
+
+
+def _lines(report: Report, name: str) -> list[int | None]:
+    """The line of each finding's key, or of the macro place in which it is; None for what is not about the task file."""
+    from coordinator.taskfile.errors import key_lines, line_of
+
+    lines = key_lines(task_path(name).read_text(encoding="utf-8"))
+    return [None if f.code == NO_CELL else line_of(f.key, lines) for f in report.findings]
+
+
+def _text(name: str, analysis: Analysis | None, ok: bool) -> str:
+    ended, lines = "", list[str]()
     if analysis is not None:
         verdicts = {True: "yes", False: "NO", None: "unknown"}
         shown = {k: v for k, v in analysis.verdicts().items() if k != "safe"}  # runs to do are several tokens
         told = [f"{key.replace('_', ' ')} {verdicts[v.holds]}" for key, v in shown.items()]
-        searched = (
-            ""
-            if analysis.qualitative.space.complete
-            else "; the search was cut short (petrobot analyse goes on longer)"
-        )
         lines += [f"{'note':8}final: {note}" for note in analysis.notes]
-        lines.append(f"{len(analysis.qualitative.space)} markings: {', '.join(told)}{searched}")
+        lines.append(f"{len(analysis.qualitative.space)} markings: {', '.join(told)}{_cut(analysis)}")
         lines += _objections(analysis)
         if analysis.objections:
             lines.append(f"petrobot analyse {name} --pictures FOLDER shows how it comes to that")
         ended = "was not checked to its end (Ctrl-C)" if ok and analysis.interrupted else ""
     return "\n".join([*lines, f"{name}: {ended or ('may run' if ok else 'may not run')}"])
+
+
+def _cut(analysis: Analysis) -> str:
+    """Why the search ended early, and whether `analyse` would go on: not beyond a proof that the net has no end."""
+    from coordinator.analysis.report import ENDLESS
+
+    space = analysis.qualitative.space
+    if space.complete:
+        return ""
+    longer = "" if space.reason == ENDLESS else "; petrobot analyse goes on longer"
+    return f"; the search was cut short ({space.reason}{longer})"
 
 
 def _objections(analysis: Analysis) -> list[str]:

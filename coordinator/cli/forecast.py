@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
 from coordinator.cli.loading import load_task, write_json
+from coordinator.cli.quantities import whole
 
 if TYPE_CHECKING:
     from coordinator.campaign.plan import Plan
@@ -32,15 +33,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a campaign's folder, or an estimates file without its throws",
     )
     parser.add_argument(
-        "--runs", type=int, default=1000, metavar="N", help="that will be run in each regime (%(default)s)"
+        "--runs", type=whole(), default=1000, metavar="N", help="that will be run in each regime (%(default)s)"
     )
     parser.add_argument("--regime", default="", metavar="A,B", help="only these (default: all that were measured)")
     parser.add_argument(
         "--choose", default="", metavar="TASK=ACTION,...", help="choices of the new runs (default: as measured)"
     )
     parser.add_argument("--learned", metavar="CAMPAIGN", type=Path, help="new runs take what this campaign has learned")
-    parser.add_argument("--replicates", type=int, default=400, metavar="B", help="of the bootstrap (%(default)s)")
-    parser.add_argument("--seed", type=int, default=1, metavar="S", help="of the simulation (%(default)s)")
+    parser.add_argument("--replicates", type=whole(20), default=400, metavar="B", help="of the bootstrap (%(default)s)")
+    parser.add_argument("--seed", type=whole(0), default=1, metavar="S", help="of the simulation (%(default)s)")
     parser.add_argument("--out", metavar="FILE", type=Path, help="register the forecast here; never written over")
     parser.add_argument(
         "--compare", nargs=2, metavar=("FORECAST", "CAMPAIGN"), type=Path, help="compare with what was measured"
@@ -122,8 +123,6 @@ def _request(task: Task, trainings: Mapping[str, Training], regime: str, options
             known = ", ".join(primitive.alternatives if primitive else task.primitive_tasks)
             raise CommandError(2, f"--choose {name}={action}: not known to {task.name}; choose among {known}")
         choices[name] = {action: 1.0}
-    if options.runs < 1 or options.replicates < 20:
-        raise CommandError(2, "--runs needs at least 1, --replicates at least 20")
     return Request(options.runs, choices, options.seed, options.replicates)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -42,6 +43,11 @@ def give(
         from coordinator.cli.progress import print_result
 
         print_result(result)
+        if folder is None and result["status"] != "success":
+            print(
+                "not kept; with --journal runs, `petrobot log` and `petrobot report` show what led there",
+                file=sys.stderr,
+            )
     if options.report is not None:
         from coordinator.drawing import draw
         from coordinator.report import report_html

@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from coordinator.cli.quantities import whole
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
@@ -25,7 +27,7 @@ def add_journal_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--keep",
-        type=_count,
+        type=whole(),
         metavar="N",
         help="remove the oldest ended runs of that folder beyond N when this one has ended",
     )
@@ -34,13 +36,6 @@ def add_journal_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="sync the journal before every start, also of actions without a device (costs a sync each)",
     )
-
-
-def _count(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not at least 1")
-    return value
 
 
 def journal_folder(options: argparse.Namespace) -> Path | None:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from coordinator.cli import CommandError
 from coordinator.cli.judged import refuse_unknown_context, show
-from coordinator.cli.learning import no_less_than_nothing, reliability
 from coordinator.cli.propagated import show_task
+from coordinator.cli.quantities import number, probability
 
 if TYPE_CHECKING:
     from coordinator.experience.estimates_file import EstimatesFile, Kept
@@ -35,15 +35,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--target",
-        type=reliability,
+        type=probability,
         metavar="R",
         help="target reliability: which scenarios and actions meet it (default: the one they were judged by)",
     )
     parser.add_argument(
-        "--budget", type=no_less_than_nothing, metavar="C", help="what reliability may be had for this cost at most"
+        "--budget", type=number(above=0.0), metavar="C", help="what reliability may be had for this cost at most"
     )
     parser.add_argument(
-        "--rho", type=no_less_than_nothing, metavar="W", help="weight of cost in J (default: 1 / the largest cost)"
+        "--rho", type=number(least=0.0), metavar="W", help="weight of cost in J (default: 1 / the largest cost)"
     )
     parser.add_argument("--selectors", action="store_true", help="reset: forget selectors' states, keep the estimates")
     parser.add_argument("--json", metavar="FILE", help="write what is shown as JSON (- for standard output)")

@@ -6,11 +6,11 @@ import argparse
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
+from coordinator.cli.quantities import probability
 
 if TYPE_CHECKING:
     from coordinator.experience.learning_session import LearningSession
@@ -42,7 +42,7 @@ def add_learning_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--target",
-        type=reliability,
+        type=probability,
         metavar="R",
         help="choose among actions that reach this reliability (with --learn)",
     )
@@ -55,29 +55,6 @@ def add_learning_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--frozen", action="store_true", help="choose the best that was learned, and learn nothing (with --learn)"
     )
-
-
-def reliability(text: str) -> float:
-    """A target reliability on the command line. Raises ArgumentTypeError."""
-    value = _number(text)
-    if not 0 < value <= 1:
-        raise argparse.ArgumentTypeError(f"{text} is no reliability: it must be above 0 and at most 1")
-    return value
-
-
-def no_less_than_nothing(text: str) -> float:
-    """A weight or a cost on the command line: 0 or more, and finite. Raises ArgumentTypeError."""
-    value = _number(text)
-    if not 0 <= value < inf:
-        raise argparse.ArgumentTypeError(f"{text} is no weight or cost: it must be 0 or more, and finite")
-    return value
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError as fault:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number") from fault
 
 
 def opened(

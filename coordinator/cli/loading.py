@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 SHIPPED = Path(__file__).parents[1] / "tasks"
 """Tasks that come with petrobot; they are known by their bare names."""
+SHIPPED_CELL = Path(__file__).parents[2] / "services.toml"
+"""The location file that comes with petrobot."""
 OWN = Path("tasks")
 """Where the operator's page saves tasks: beside what one works on."""
 
@@ -27,7 +29,8 @@ def add_services_argument(parser: argparse.ArgumentParser) -> None:
         "--services",
         metavar="FILE",
         type=Path,
-        help="the location file (default: services.toml here, else the one that comes with petrobot)",
+        help="the location file (default: the one that the task names in `services`, where there is a task that does, "
+        "else services.toml here, else the one that comes with petrobot)",
     )
 
 
@@ -64,14 +67,30 @@ def services_path(given: Path | None) -> Path:
     if given is not None:
         return given
     here = Path("services.toml")
-    return here if here.exists() else Path(__file__).parents[2] / "services.toml"
+    return here if here.exists() else SHIPPED_CELL
 
 
 def cell_path(given: Path | None, name: str, task: Task) -> Path:
-    """services.toml for a task, which was named so on the command line: the given one, the task's own, or the one at hand."""
-    if given is None and task.services:
-        return task_path(name).parent / task.services
-    return services_path(given)
+    """services.toml for a task, which was named so on the command line: the given one, the task's own, or the one at hand.
+
+    Raises CommandError where the task names a file that is not there.
+    """
+    if given is not None or not task.services:
+        return services_path(given)
+    written = task_path(name)
+    path = written.parent / task.services
+    if not path.is_file():
+        what = f"{path} is no file" if path.exists() else f"no such file: {path}"
+        remedy = f"name one relative to {written.name}, drop the key, or give --services FILE"
+        raise CommandError(2, f"{file_line(written, 'task.services')}: task.services: {what}; {remedy}")
+    return path
+
+
+def file_line(path: Path, key: str) -> str:
+    """FILE:LINE of a key of a TOML file."""
+    from coordinator.taskfile.errors import key_lines, line_of
+
+    return f"{path}:{line_of(key, key_lines(path.read_text(encoding='utf-8')))}"
 
 
 def load_directory(given: Path | None) -> Directory:
@@ -82,7 +101,8 @@ def load_directory(given: Path | None) -> Directory:
     try:
         return load(path)
     except OSError as fault:
-        raise CommandError(2, f"{path}: {fault.strerror or fault}") from fault
+        text = f"{path}: {fault.strerror or fault}; give --services a location file that can be read"
+        raise CommandError(2, text) from fault
     except DirectoryError as fault:
         raise CommandError(2, str(fault)) from fault
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
+from coordinator.cli.loading import file_line
 
 if TYPE_CHECKING:
     import argparse
@@ -109,17 +110,20 @@ def substitutes(mock: Path | None, directory: Directory) -> Mapping[str, Callabl
     """The scripted actions of a file, None without one."""
     if mock is None:
         return None
+    from coordinator.conditions.wording import nearest
     from coordinator.launch import SCRIPTED, load_object
 
     try:
         scripted: Mapping[str, Callable[..., Any]] = load_object(SCRIPTED)(mock)
     except OSError as fault:
-        raise CommandError(2, f"{mock}: {fault.strerror}") from fault
+        raise CommandError(2, f"{mock}: {fault.strerror}; give --mock a file of scripted actions") from fault
     except Exception as fault:
         raise CommandError(2, str(fault)) from fault
     for name in scripted:
         if name not in directory.actions:
-            raise CommandError(2, f"{mock}: actions.{name}: {directory.source} has no such action")
+            key = f"actions.{name}"
+            what = f"{directory.source} has no such action{nearest(name, directory.actions)}"
+            raise CommandError(2, f"{file_line(mock, key)}: {key}: {what}; name one of its actions, or drop it here")
     return scripted
 
 

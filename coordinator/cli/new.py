@@ -169,7 +169,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Write the files; none that exists is touched."""
     name = options.name
-    if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or keyword.iskeyword(name):
+    if keyword.iskeyword(name):
+        raise CommandError(2, f"{name!r} is a word of Python itself (a keyword): choose another name")
+    if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         raise CommandError(2, f"{name!r} is no name for it: use small letters, digits and _, beginning with a letter")
     folder: Path = options.folder
     if options.what == "action":

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import json
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from coordinator.cli.loading import add_services_argument, load_directory, write_json
+from services.comm.durations import positive
 from services.comm.expiry import SOON
+
+if TYPE_CHECKING:
+    from services.comm.directory import Directory
 
 EXAMPLE = "petrobot nodes --json -"
 
@@ -18,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     add_services_argument(parser)
     parser.add_argument(
-        "--timeout", type=float, default=2.0, metavar="S", help="seconds to wait (default: %(default)s)"
+        "--timeout", type=positive, default=2.0, metavar="S", help="seconds to wait (default: %(default)s)"
     )
     parser.add_argument("--json", metavar="FILE", help="write the answers as JSON (- for standard output)")
 
@@ -27,12 +31,29 @@ def run(options: argparse.Namespace) -> int:
     """Ask; 0 when all are up, 3 otherwise."""
     from coordinator.mission.asking import ask_all
 
-    answers = asyncio.run(ask_all(load_directory(options.services), options.timeout))
+    directory = load_directory(options.services)
+    answers = asyncio.run(ask_all(directory, options.timeout))
+    for node, devices in _stopped(directory, answers).items():
+        answers[node]["stopped"] = devices
     if options.json:
         write_json(options.json, answers)
     if options.json != "-":
         _print(answers)
     return 0 if all(answer["up"] for answer in answers.values()) else 3
+
+
+def _stopped(directory: Directory, answers: Mapping[str, Any]) -> dict[str, list[str]]:
+    """By node the devices that an emergency stop holds: as it says itself, or as this host says of one that does not run."""
+    from coordinator.operator.emergency import still_stopped
+    from services.comm.latch import ALL, latch_of
+
+    told = {node: list(answer["status"].get("emergency", ())) for node, answer in answers.items() if answer["up"]}
+    for node in still_stopped(directory):
+        if node not in told:
+            latched = latch_of(directory.source, node).stopped()
+            own = [device.name for device in directory.devices.values() if device.node == node]
+            told[node] = [device for device in own if device in latched or ALL in latched]
+    return {node: devices for node, devices in told.items() if devices}
 
 
 def _print(answers: dict[str, Any]) -> None:
@@ -46,11 +67,19 @@ def _print(answers: dict[str, Any]) -> None:
     for node, answer in answers.items():
         state = "[green]up[/]" if answer["up"] else "[red]away[/]"
         devices = answer.get("status", {}).get("devices", {})
-        shown = ", ".join(devices) if isinstance(devices, dict) else json.dumps(devices)
+        shown = _devices(devices, answer.get("stopped", []))
         ends = [_ends(answer.get("certificate_ends", ""))] if certified else []
         offers = ", ".join(answer.get("offers", [answer.get("why", "")]))
         table.add_row(node, answer["address"], state, *ends, offers, shown)
     Console().print(table)
+
+
+def _devices(devices: Iterable[str], stopped: Sequence[str]) -> str:
+    """Names of devices, each that an emergency stop holds with what to do about it."""
+    return ", ".join(
+        f"{device} [red]stopped (petrobot estop --clear)[/]" if device in stopped else device
+        for device in dict.fromkeys((*devices, *stopped))
+    )
 
 
 def _ends(ends: str) -> str:

@@ -20,6 +20,8 @@ REFRESH = 0.1
 LONGEST_TABLE = 24
 WIDEST_TABLE = 9
 """Columns; wider tables are for --json and the report."""
+LAST_ERRORS = "last_errors"
+"""Key of a result under which the actions stand whose errors came last (`Mission.result`): a line each instead of a table."""
 
 
 @contextmanager
@@ -58,7 +60,8 @@ def print_result(result: Mapping[str, Any]) -> None:
     console = Console()
     for key, value in result.items():
         if (
-            isinstance(value, list)
+            key != LAST_ERRORS
+            and isinstance(value, list)
             and value
             and all(isinstance(row, Mapping) for row in value)
             and len(value[0]) <= WIDEST_TABLE
@@ -68,7 +71,17 @@ def print_result(result: Mapping[str, Any]) -> None:
     for key, value in result.items():
         if isinstance(value, bool | int | float | str):
             plain.add_row(Text(key, style="dim"), _cell(key, value))
+        elif key == LAST_ERRORS:
+            for row in value:
+                plain.add_row(Text("error", style="dim"), Text(_error(row), style=COLOURS["error"]))
     console.print(plain)
+
+
+def _error(row: Mapping[str, Any]) -> str:
+    """One action that ended in ERROR, in a line."""
+    place = f" on {row['node']}" if row["node"] else ""
+    why = ": ".join(filter(None, (row["cause"], row["text"])))
+    return f"{row['run']}, {row['action'] or 'no action'}{place} for {row['primitive_task']}: {why or 'it does not say why'}"
 
 
 def _table(title: str, rows: list[Mapping[str, Any]]) -> Table:

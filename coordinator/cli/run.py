@@ -24,7 +24,10 @@ from coordinator.cli.loading import (
     load_task,
     refuse_misplaced,
 )
+from coordinator.cli.lockstep import substitutes
+from coordinator.cli.page_port import add_page_port_argument, named_port
 from coordinator.cli.parameters import pairs, parameter_of
+from coordinator.cli.quantities import whole
 
 if TYPE_CHECKING:
     from coordinator.launch import Setting
@@ -36,6 +39,8 @@ if TYPE_CHECKING:
 
 MODES = ("realtime", "lockstep")
 SEED = 1
+MOST_STATES, LONGEST = 20_000, 1.0
+"""Markings and seconds that are spent on a task's state space before it runs."""
 EXAMPLE = "petrobot run catch_ball --mode lockstep --runs 20 --seed 1 --json out.json"
 
 
@@ -47,11 +52,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a task file, or the name of a task that comes with petrobot (with --from: that of the run)",
     )
     parser.add_argument(
-        "--runs", type=_positive, metavar="N", help="how many runs (default: tokens in the task's runs place)"
+        "--runs", type=whole(), metavar="N", help="how many runs (default: tokens in the task's runs place)"
     )
     parser.add_argument("--mode", choices=MODES, help=f"default: {MODES[0]}, with --from {MODES[1]}")
     parser.add_argument(
-        "--seed", type=int, metavar="S", help=f"of all chance in the run (default: {SEED}, with --from that of the run)"
+        "--seed",
+        type=whole(0),
+        metavar="S",
+        help=f"of all chance in the run (default: {SEED}, with --from that of the run)",
     )
     parser.add_argument("--regime", metavar="NAME", help="the same as --set regime=NAME")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the task")
@@ -86,9 +94,7 @@ def add_page_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--no-page", action="store_true", help="serve no operator's page; the command line still steers the run"
     )
-    parser.add_argument(
-        "--page-port", type=int, default=0, metavar="PORT", help="the page's port (default: a free one)"
-    )
+    add_page_port_argument(parser)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -113,7 +119,9 @@ def run(options: argparse.Namespace) -> int:
     _refuse_unfit(task, directory)
     if (options.mode == "lockstep" or options.up) and not options.join:
         refuse_misplaced(directory, everywhere=options.mode == "lockstep", scripted=options.mock is not None)
+    substitutes(options.mock, directory)  # refuses a script for actions that there are not
     setting = _setting(task, directory, options)
+    _warn(task, options)
     begun = time.perf_counter()
     try:
         if options.mode == "lockstep":
@@ -136,21 +144,28 @@ def run(options: argparse.Namespace) -> int:
     return 0 if result["status"] == "success" else 1
 
 
-def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not at least 1")
-    return value
-
-
 def _refuse_unfit(task: Task, directory: Directory) -> None:
     from coordinator.check import check
 
-    report = check(task, {action: entry.node for action, entry in directory.actions.items()})
+    offers = {action: entry.node for action, entry in directory.actions.items()}
+    report = check(task, offers, source=str(directory.source))
     faults = [f for f in report.findings if f.severity == "error"]
     if faults:
         lines = "\n".join(f"  {f.key}: {f.text}\n    {f.remedy}" for f in faults)
         raise CommandError(2, f"{task.name} may not run:\n{lines}")
+
+
+def _warn(task: Task, options: argparse.Namespace) -> None:
+    """Say what a short look at the state space finds against running it: whoever runs it all the same may want to see that."""
+    from coordinator.analysis.report import analyse
+    from coordinator.analysis.space import Limits
+
+    if options.quiet:
+        return
+    limits = Limits(states=MOST_STATES, seconds=LONGEST, clock=time.monotonic)
+    for name, verdict in analyse(task, limits=limits).objections.items():
+        told = f"warning: {task.name}: {name.replace('_', ' ')}: {verdict.reason} (petrobot check {options.task} says more)"
+        print(told, file=sys.stderr)
 
 
 def _refuse_stopped(directory: Directory) -> None:
@@ -263,15 +278,16 @@ async def _page(shell: RealtimeMission, options: argparse.Namespace) -> AsyncIte
     operation = Operation(shell, selector)
     history = JournalHistory(options.folder.parent)
     callers, directory = shell.mission.callers, shell.mission.executor.directory
-    page = await start_page(
-        operation,
-        tasks_folder=OWN_TASKS,
-        shipped=SHIPPED,
-        port=options.page_port,
-        offers=lambda: offered(directory, lambda action, node: callers[node].up and action in callers[node].offers),
-        history=history,
-        page=not options.no_page,
-    )
+    with named_port(options.page_port):
+        page = await start_page(
+            operation,
+            tasks_folder=OWN_TASKS,
+            shipped=SHIPPED,
+            port=options.page_port,
+            offers=lambda: offered(directory, lambda action, node: callers[node].up and action in callers[node].offers),
+            history=history,
+            page=not options.no_page,
+        )
     if not options.no_page:
         print(f"page: {page.url}", file=sys.stderr, flush=True)
     executor = shell.mission.executor

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
 from coordinator.cli.loading import SHIPPED, add_services_argument, load_directory
+from coordinator.cli.lockstep import substitutes
+from coordinator.cli.page_port import add_page_port_argument, named_port
 
 if TYPE_CHECKING:
     from coordinator.hmi.server import Page
@@ -37,9 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--up", action="store_true", help="launch the nodes of this host, and end them with this command"
     )
     parser.add_argument("--mock", metavar="FILE", type=Path, help="with --up: replace actions by scripted ones")
-    parser.add_argument(
-        "--page-port", type=int, default=0, metavar="PORT", help="the page's port (default: a free one)"
-    )
+    add_page_port_argument(parser)
     parser.add_argument(
         "--estimates",
         metavar="FOLDER",
@@ -54,7 +54,9 @@ def run(options: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
     if options.mock is not None and not options.up:
         raise CommandError(2, "--mock is for nodes that are launched here: give --up, too, or `petrobot up --mock`")
-    return asyncio.run(_serve(load_directory(options.services), options))
+    directory = load_directory(options.services)
+    substitutes(options.mock, directory)  # refuses a script for actions that there are not
+    return asyncio.run(_serve(directory, options))
 
 
 async def _serve(directory: Directory, options: argparse.Namespace) -> int:
@@ -87,7 +89,7 @@ async def _page(station: Station, runs: Path, options: argparse.Namespace, stop:
     from coordinator.hmi.journals import JournalHistory
     from coordinator.hmi.server import start_page
 
-    try:
+    with named_port(options.page_port):
         page = await start_page(
             station,
             tasks_folder=options.tasks,
@@ -97,8 +99,6 @@ async def _page(station: Station, runs: Path, options: argparse.Namespace, stop:
             history=JournalHistory(runs),
             starts=station.form,
         )
-    except OSError as fault:
-        raise CommandError(2, f"port {options.page_port}: {fault.strerror}; choose another with --page-port") from fault
     station.door = _doors(station.directory, page)
     try:
         print(f"page: {page.url}\nCtrl-C ends it", flush=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from coordinator.cli.loading import task_path
+from coordinator.cli.quantities import number, whole
 
 EXAMPLE = "petrobot simulate catch_ball --replicas 2000 --seed 1"
 
@@ -15,9 +16,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rates", metavar="FILE", help="a rates file, or the word unit, for a net without rates of its own"
     )
-    parser.add_argument("--replicas", type=int, default=1000, metavar="N", help="how often (default: %(default)s)")
-    parser.add_argument("--horizon", type=float, metavar="S", help="simulated seconds; a net that never ends needs it")
-    parser.add_argument("--seed", type=int, default=1, metavar="S", help="default: %(default)s")
+    parser.add_argument("--replicas", type=whole(), default=1000, metavar="N", help="how often (default: %(default)s)")
+    parser.add_argument(
+        "--horizon", type=number(above=0.0), metavar="S", help="simulated seconds; a net that never ends needs it"
+    )
+    parser.add_argument("--seed", type=whole(0), default=1, metavar="S", help="default: %(default)s")
     parser.add_argument(
         "--what-if",
         "-w",

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 
 from coordinator.cli import CommandError
 from coordinator.cli.loading import add_services_argument, load_directory, refuse_misplaced
+from coordinator.cli.lockstep import substitutes
+from services.comm.durations import not_negative
 
 if TYPE_CHECKING:
     from services.comm.directory import Directory
@@ -29,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--await-coordinator",
-        type=float,
+        type=not_negative,
         default=600.0,
         metavar="S",
         help="lock step: how long a coordinator that died is waited for (%(default)g s of wall time)",
@@ -42,6 +44,7 @@ def run(options: argparse.Namespace) -> int:
     """Launch and watch."""
     directory = load_directory(options.services)
     refuse_misplaced(directory, scripted=options.mock is not None)
+    substitutes(options.mock, directory)  # refuses a script for actions that there are not
     return asyncio.run(_up(directory, options))
 
 

@@ -97,11 +97,19 @@ def read(path: Path) -> dict[str, Any]:
         if found["schema"] != SCHEMA:
             raise ForecastError(f"{path}: schema {found['schema']!r}, this petrobot reads {SCHEMA}")
         said = found["sha256"]
-    except (OSError, ValueError, KeyError, TypeError) as fault:
-        raise ForecastError(f"{path} is no forecast: {fault!r}") from fault
+    except OSError as fault:
+        raise _no_forecast(path, fault.strerror or str(fault)) from fault
+    except ValueError as fault:
+        raise _no_forecast(path, f"it is no JSON ({fault})") from fault
+    except (KeyError, TypeError, AttributeError) as fault:
+        raise _no_forecast(path, "a table with schema and sha256 is missing") from fault
     if said != _hash(body):
         raise ForecastError(f"{path} was changed after it was registered")
     return found
+
+
+def _no_forecast(path: Path, why: str) -> ForecastError:
+    return ForecastError(f"{path} is no forecast: {why}; give a file that `petrobot forecast --out FILE` wrote")
 
 
 def exact(task: Task, estimates: Estimates, regime: str, choice: Choice) -> dict[str, Any]:

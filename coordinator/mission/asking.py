@@ -19,6 +19,9 @@ from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
 async def ask_all(directory: Directory, timeout: float) -> dict[str, Any]:
     """What each node answers within `timeout` s: address, whether it is up, what it offers, its status; else why not.
 
+    `status` has the node's `devices`, those that an emergency stop holds in `emergency`, and what is told of its actions
+    without a device in `general`.
+
     With mutual TLS also when the certificate ends that the node shows.
     """
     asked = await asyncio.gather(*(_ask(directory, node, timeout) for node in directory.nodes))
@@ -49,7 +52,12 @@ async def _ask(directory: Directory, node: str, timeout: float) -> dict[str, Any
             status = await asyncio.wait_for(told, timeout)
             if (ends := client.certificate_ends) is not None:
                 answer["certificate_ends"] = datetime.fromtimestamp(ends, UTC).isoformat()
-            answer |= {"offers": list(caller.offers), "boot": caller.boot, "version": NEWEST_VERSION, "status": status}
+            answer |= {
+                "offers": list(caller.offers),
+                "boot": caller.boot,
+                "version": NEWEST_VERSION,
+                "status": _status(status, node, directory),
+            }
         else:
             answer["why"] = refused[-1] if refused else client.trouble
     except TimeoutError:
@@ -57,3 +65,13 @@ async def _ask(directory: Directory, node: str, timeout: float) -> dict[str, Any
     finally:
         await client.close()
     return answer
+
+
+def _status(status: dict[str, Any], node: str, directory: Directory) -> dict[str, Any]:
+    """A node's status with devices alone under `devices`: it tells of its actions without one under its own name."""
+    answers, devices = dict(status.get("answers", {})), dict(status.get("devices", {}))
+    general = {}
+    if node not in directory.devices and node in devices:
+        answers.pop(node, None)
+        general = {"general": devices.pop(node)}
+    return {**status, "answers": answers, "devices": devices, **general}

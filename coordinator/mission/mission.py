@@ -15,10 +15,13 @@ from coordinator.net import Marking
 from coordinator.record.recording import PREPARED, SCORED, Step
 from coordinator.task import Status
 from services.comm.caller import Caller
+from services.comm.directory import Directory, DirectoryError
 from services.comm.messages import Call, Outcome
 from services.comm.notice import Ended, Notice, PeerBack, PeerLost, Progress
 
 SERVICE_DEADLINE = 20.0
+TOLD_ERRORS = 6
+"""How many of the last runs that ended in ERROR the result of a mission run tells that ended so itself."""
 
 
 class Stage(Enum):
@@ -97,12 +100,35 @@ class Tally:
     def settled(self, now: float, state: State) -> None:
         """Nothing to count."""
 
+    def last_errors(self, directory: Directory) -> list[dict[str, Any]]:
+        """The last runs that ended in ERROR, in the order in which they ended: which action, on which node, and why."""
+        failed = [record for record in self.runs if record.status is Status.ERROR][-TOLD_ERRORS:]
+        return [
+            {
+                "run": record.run,
+                "primitive_task": record.primitive_task,
+                "action": record.action,
+                "node": _node_of(record.action, directory),
+                "cause": record.cause,
+                "text": record.text,
+            }
+            for record in failed
+        ]
+
     def _cycle(self, now: float, before: Marking, after: Marking) -> None:
         if self.runs_place is None or after[self.runs_place] >= before[self.runs_place]:
             return
         if self.cycles:
             self.cycles[-1].ended = now
         self.cycles.append(Cycle(len(self.cycles) + 1, now))
+
+
+def _node_of(action: str, directory: Directory) -> str:
+    """Where an action runs; empty for a run that never came to one."""
+    try:
+        return directory.where(action)
+    except DirectoryError:
+        return ""
 
 
 class Mission:
@@ -119,6 +145,8 @@ class Mission:
         """Where the task begins, if not at its own beginning (a simulated run alone: no real world stands elsewhere at will)."""
         self.lost: dict[str, str] = {}
         """Nodes that are away, with the reason."""
+        self.remarks: dict[str, str] = {}
+        """What else the result tells, from whoever drives the mission run: that the host was too busy for it."""
         self._early: list[tuple[str, Notice]] = []
         task = executor.task.flat
         index = task.net.place_index.get(task.runs_place) if task.runs_place else None
@@ -189,8 +217,13 @@ class Mission:
         return self.executor.due() if self.stage is Stage.RUNNING else None
 
     def result(self, mode: str, wall_s: float) -> dict[str, Any]:
-        """The result as the command line writes it; the score's own keys stand beside the general ones."""
+        """The result as the command line writes it; the score's own keys stand beside the general ones.
+
+        A mission run that ended in ERROR also has `last_errors`: the actions that ended so, the last one last.
+        """
         finished = self.executor.finished
+        failed = finished is None or finished.status is Status.ERROR
+        errors = self.tally.last_errors(self.executor.directory) if failed else []
         general = {
             "task": self.executor.task.name,
             "mode": mode,
@@ -199,6 +232,8 @@ class Mission:
             "runs": self.runs,
             "status": finished.status.value if finished else Status.ERROR.value,
             "reason": finished.reason if finished else "not finished",
+            **({"last_errors": errors} if errors else {}),
+            **self.remarks,
         }
         durations = {
             "wall_s": round(wall_s, 3),

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping, Sequence
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from shlex import quote
 from typing import Final
 
 from coordinator.mission.mission import Mission, MissionError, Stage
+from coordinator.mission.punctuality import PERIOD, Punctuality
 from coordinator.record.journal import JournalError
 from services.comm.client import Client
 from services.comm.credentials import COORDINATOR, Credentials, credentials
@@ -18,6 +21,9 @@ LINGER = 1.0
 LEAVE: Final = 2.5
 """Seconds after the loss of a node in which it may come back to be told good-bye: a little longer than it keeps the leases of
 one who has gone without a word (`services.comm.results.Keeping.lease`)."""
+
+KEY_CODES: Final = ("key_needed", "no_key_here", "no_key_there", "wrong_key")
+"""Refusals (docs/protocol.md) of one whose key is not that of the node."""
 
 
 class UnreachableError(Exception):
@@ -39,6 +45,8 @@ class RealtimeMission:
         self._fault: BaseException | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._lost_at: dict[str, float] = {}
+        self._punctuality = Punctuality()
+        self._looking: asyncio.TimerHandle | None = None
         key, tls = (proves.key, proves.client()) if proves is not None else (None, None)
         self.clients: Mapping[str, Client] = {
             name: Client(node.host, node.port, mission.callers[name], on_notices=self._hear(name), key=key, tls=tls)
@@ -52,10 +60,20 @@ class RealtimeMission:
         reached = await asyncio.gather(*(client.connected(timeout) for client in self.clients.values()))
         missing = [name for name, up in zip(self.clients, reached, strict=True) if not up]
         if missing:
-            addresses = ", ".join(self._missed(name) for name in missing)
-            raise UnreachableError(missing, f"no answer from {addresses}; launch them with `petrobot up`")
+            raise UnreachableError(missing, "; ".join(self._missed(missing)))
 
-    def _missed(self, node: str) -> str:
+    def _missed(self, missing: Sequence[str]) -> Iterator[str]:
+        """Why nodes are not reached and what to do: those that run and refuse us need something else than to be launched."""
+        source = quote(os.path.normpath(self.mission.executor.directory.source))
+        refusing = [name for name in missing if self.clients[name].answered]
+        if away := [name for name in missing if name not in refusing]:
+            yield f"no answer from {', '.join(map(self._tried, away))}; launch them with `petrobot up --services {source}`"
+        if refusing:
+            keys = any(code in self.clients[name].trouble for name in refusing for code in KEY_CODES)
+            remedy = f"; give both sides the same key file: that which keys.file of {source} names" if keys else ""
+            yield f"not let in by {', '.join(map(self._tried, refusing))}{remedy}"
+
+    def _tried(self, node: str) -> str:
         client = self.clients[node]
         return f"{node} at {client.host}:{client.port}" + (f" ({client.trouble})" if client.trouble else "")
 
@@ -66,7 +84,10 @@ class RealtimeMission:
         """
         (begin or self.mission.start)(self._loop.time())
         self.settle()
+        self._look_again(self._loop.time() + PERIOD)
         await self._over.wait()
+        if remark := self._punctuality.remark():
+            self.mission.remarks["host"] = remark
         if self._fault is not None:
             raise self._fault
 
@@ -74,8 +95,9 @@ class RealtimeMission:
         """Leave the nodes in good order: each hears what was not acknowledged yet and a good-bye, which frees its devices for
         the next run at once. One that was just lost is waited for as long as it would keep them for this one."""
         self._closed = True
-        if self._timer is not None:
-            self._timer.cancel()
+        for timer in (self._timer, self._looking):
+            if timer is not None:
+                timer.cancel()
         await asyncio.gather(*(self._leave(name, client) for name, client in self.clients.items()))
 
     async def _leave(self, name: str, client: Client) -> None:
@@ -110,6 +132,14 @@ class RealtimeMission:
         if self._timer is not None:
             self._timer.cancel()
         self._timer = None if due is None else self._loop.call_at(due, self._wake)
+
+    def _look_again(self, due: float) -> None:
+        """See how late the loop comes to what is due: if it is, so are the other processes of this host."""
+
+        def look() -> None:
+            self._look_again(self._punctuality.look(due, self._loop.time()))
+
+        self._looking = self._loop.call_at(due, look)
 
     def _wake(self) -> None:
         self._guarded(lambda now: self.mission.advance(now))

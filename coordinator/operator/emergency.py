@@ -94,6 +94,7 @@ class EmergencyLine:
         self.reached = False
         self._name = name
         self._numbers = 0
+        self._device_names = frozenset(directory.devices)
         self._answers: dict[str, asyncio.Future[Mapping[str, Any]]] = {}
         self.client = Client(
             entry.host, entry.port, caller, on_notices=self._hear, key=credentials.key, tls=credentials.client()
@@ -128,6 +129,11 @@ class EmergencyLine:
             return {str(device): str(answer) for device, answer in answers.items()}
         self.why = str(data.get("text") or data.get("cause") or "an answer that says nothing")
         return None
+
+    def devices_of(self, answers: Mapping[str, str]) -> dict[str, str]:
+        """Answers of devices: that under the node's own name is of its actions without one, unless a device is called so."""
+        own = {self.node} - self._device_names
+        return {device: answer for device, answer in answers.items() if device not in own}
 
     async def close(self) -> None:
         """Hang up."""
@@ -189,8 +195,8 @@ async def _ask(line: EmergencyLine, stopped: Stopped, verb: str) -> None:
                 break
             if stopped.seconds is None:
                 stopped.seconds = loop.time() - begun
-            stopped.devices, stopped.note = answers, line.note or stopped.note
-            if "stopping" not in answers.values() or loop.time() - begun > STANDSTILL:
+            stopped.devices, stopped.note = line.devices_of(answers), line.note or stopped.note
+            if "stopping" not in stopped.devices.values() or loop.time() - begun > STANDSTILL:
                 return
             await asyncio.sleep(ASK_AGAIN)
     stopped.why = line.why

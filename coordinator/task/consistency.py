@@ -34,6 +34,7 @@ from coordinator.task.elements import (
 )
 from coordinator.task.macros import macro_faults
 from coordinator.task.model import Task
+from coordinator.task.subnets import CircleError
 
 _IDENTIFIER = re.compile(r"[^\W\d]\w*\Z")
 _RESERVED = frozenset({"and", "or", "not", "true", "false", "none"})
@@ -306,14 +307,14 @@ def _whole(task: Task) -> Iterator[Fault]:
     """What can be judged only when the parts are right: expansion, conditions, predicates."""
     try:
         flat = task.flat
-    except ValueError as error:
-        yield Fault("subnets", str(error), "break the circle")
+    except CircleError as circle:
+        yield Fault(circle.key, str(circle), "break the circle")
         return
     yield from _macro_exits(task)
     domains = condition_domains(flat)
     for t in flat.transitions.values():
         if t.when is not None:
-            yield from _expression(_written_key(t.name), t.when, domains)
+            yield from _expression(_written_key(task, t.name), t.when, domains)
     for key, predicate in (("task.final", task.final), ("task.final_error", task.final_error)):
         if predicate is not None:
             yield from _expression(key, predicate, marking_domains(flat))
@@ -347,5 +348,11 @@ def _expression(key: str, expression: Expression, domains: Mapping[str, Domain])
         yield Fault(key, f"in {expression.text!r}, {text}", "")
 
 
-def _written_key(flat_name: str) -> str:
-    return f"transitions.{flat_name}.when"
+def _written_key(task: Task, flat_name: str) -> str:
+    """The key in the task file of a flat transition's condition: that of the subnet in which it is written."""
+    *macros, name = flat_name.split(".")
+    key, places = "", task.places
+    for macro in macros:
+        subnet = task.subnets[places[macro].subnet]
+        key, places = f"subnets.{subnet.name}.", subnet.places
+    return f"{key}transitions.{name}.when"

@@ -13,6 +13,14 @@ from coordinator.conditions import rename
 from coordinator.task.elements import End, Input, Kind, Output, Place, Subnet, Transition
 
 
+class CircleError(ValueError):
+    """A subnet that contains itself; `key` is that of the place, in the task file, by which it does."""
+
+    def __init__(self, inside: tuple[str, ...], place: Place) -> None:
+        super().__init__(f"subnet {place.subnet!r} contains itself by {' > '.join((*inside, place.subnet))}")
+        self.key = f"subnets.{inside[-1]}.places.{place.name}.subnet"
+
+
 @dataclass(frozen=True, slots=True)
 class _Flat:
     """What has been unfolded so far, by full name."""
@@ -29,7 +37,7 @@ def unfolded(
 ) -> tuple[dict[str, Place], dict[str, Transition]]:
     """Places and transitions of the flat net.
 
-    Raises ValueError on subnets that contain themselves; other faults are for `consistency.faults`.
+    Raises CircleError on subnets that contain themselves; other faults are for `consistency.faults`.
     """
     flat = _Flat(subnets)
     _unfold(flat, "", places, transitions, ())
@@ -51,7 +59,7 @@ def _unfold(
         if place.kind is not Kind.MACRO or not place.subnet:
             continue
         if place.subnet in inside:
-            raise ValueError(f"subnet {place.subnet!r} contains itself by {' > '.join((*inside, place.subnet))}")
+            raise CircleError(inside, place)
         flat.entered[name] = subnet = flat.subnets[place.subnet]
         _unfold(flat, f"{name}.", subnet.places, subnet.transitions, (*inside, place.subnet))
     for transition in transitions.values():

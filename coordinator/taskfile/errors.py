@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from coordinator.conditions.wording import Fault
 
-_HEADER = re.compile(r"\s*\[([^\[\]]+)\]\s*(?:#.*)?$")
+_HEADER = re.compile(r"\s*\[{1,2}([^\[\]]+)\]{1,2}\s*(?:#.*)?$")
 _KEY = re.compile(r"""\s*([\w.\-"']+)\s*=""")
 
 
@@ -23,24 +23,31 @@ class TaskFileError(ValueError):
 
 
 def key_lines(text: str) -> dict[str, int]:
-    """The line on which each dotted key of a TOML text stands, as far as a look at the lines can tell."""
+    """The line on which each dotted key of a TOML text stands, as far as a look at the lines can tell.
+
+    A table without a line of its own (`places`, where only `[places.free]` stands) has that of the first one in it.
+    """
     lines: dict[str, int] = {}
+    implied: dict[str, int] = {}
     table = ""
     for number, line in enumerate(text.splitlines(), 1):
         if header := _HEADER.match(line):
-            table = _bare(header[1])
-            lines.setdefault(table, number)
+            name = table = _bare(header[1])
         elif key := _KEY.match(line):
-            name = _bare(key[1])
-            lines.setdefault(f"{table}.{name}" if table else name, number)
-    return lines
+            name = f"{table}.{_bare(key[1])}".lstrip(".")
+        else:
+            continue
+        lines.setdefault(name, number)
+        while name := name.rpartition(".")[0]:
+            implied.setdefault(name, number)
+    return {**implied, **lines}
 
 
 def line_of(key: str, lines: Mapping[str, int]) -> int:
-    """The line of a key, or of the nearest table around it; 0 if there is none."""
+    """The line of a key, or of the nearest table around it; 1 for what the file has no table for, where it may be added."""
     while key and key not in lines:
         key = key.rpartition(".")[0]
-    return lines.get(key, 0)
+    return lines.get(key, 1)
 
 
 def _bare(key: str) -> str:

@@ -63,7 +63,8 @@ def loads(text: str, source: str = "task") -> Task:
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        line = int(found[1]) if (found := re.search(r"at line (\d+)", str(error))) else 0
+        found = re.search(r"at line (\d+)", str(error))
+        line = int(found[1]) if found else text.count("\n") + 1  # "at end of document"
         raise TaskFileError(source, [Fault("TOML", str(error), "see toml.io for the syntax")], [line]) from error
     except RecursionError as error:
         raise TaskFileError(source, [Fault("TOML", "nested too deeply", "flatten it")], [0]) from error

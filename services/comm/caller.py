@@ -16,6 +16,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 from services.comm import messages as m
+from services.comm.absence import LOST, REFUSED, UNREACHABLE, Absence
 from services.comm.events import EventIntake
 from services.comm.notice import Accepted, Answered, Ended, EventArrived, Late, Notice, PeerBack, PeerLost, Progress
 from services.comm.plain import plain
@@ -45,8 +46,7 @@ class Caller:
         """Never later than `due` (s): a shell whose timer is set for no later time need not ask for that."""
         self._auto_ack = auto_ack
         self._patience = patience or Patience()
-        self._refusal = ""
-        self._held_until: float | None = None
+        self._absence = Absence(peer, self._patience)
         self._pending = UnderWay()
         self._commands: dict[str, float] = {}
         self._names: tuple[str, ...] | None = None
@@ -73,8 +73,8 @@ class Caller:
 
     def connecting(self, now: float) -> None:
         """A first connection is being tried: calls made now wait for it as long as for a reconnection."""
-        self._held_until = now + self._patience.reconnect
-        self.soonest = min(self.soonest, self._held_until)
+        self._absence.wait(now)
+        self.soonest = min(self.soonest, self._absence.until)
 
     def call(self, now: float, call: m.Call) -> None:
         """Make a call. Raises ValueError for an id that is under way, NotPlainError for arguments that no message carries."""
@@ -116,12 +116,11 @@ class Caller:
         return len(self._messages)
 
     def _begin_unsent(self, now: float, pending: Pending) -> None:
-        id_ = pending.call.id
-        self._pending[id_] = pending
-        if self._refusal:
-            self._end(id_, "refused", self._refusal, pending.if_unsent)
-        elif self._held_until is None or now >= self._held_until:
-            self._end(id_, "unreachable", f"{self.peer} is not there", pending.if_unsent)
+        self._pending[pending.call.id] = pending
+        away = self._absence.new_call(now)
+        self.soonest = min(self.soonest, self._absence.until)
+        if away is not None:
+            self._end(pending.call.id, *away, pending.if_unsent)
 
     def cancel(self, now: float, id: str, reason: str = "", within: float | None = None) -> None:  # noqa: A002
         """Ask for a call's run to be stopped; it still ends with one `Ended`, `no_answer` if the peer does not say so
@@ -156,7 +155,7 @@ class Caller:
     def command(self, now: float, command: m.Command) -> None:
         """Give a node-level order. Raises NotPlainError for data that no message carries."""
         if not self.up:
-            self._no_answer(command.id, "unreachable")
+            self._no_answer(command.id, UNREACHABLE)
             return
         self._commands[command.id] = now + self._patience.answer
         self.soonest = min(self.soonest, now + self._patience.answer)
@@ -194,7 +193,8 @@ class Caller:
     def link_up(self, now: float, welcome: m.Welcome) -> None:
         """The peer welcomed us: what was under way is sent again under its id, or ends if this is another boot."""
         same = welcome.boot == self.boot
-        self.up, self._refusal, self._held_until = True, "", None
+        self.up = True
+        self._absence.over()
         self.boot, self.offers = welcome.boot, welcome.offers
         self._notices.append(PeerBack(welcome.name, welcome.boot, same, welcome.offers, welcome.runs))
         if not same:
@@ -232,22 +232,22 @@ class Caller:
         self._settled.link_lost()
         self._notices.append(PeerLost(reason))
         for id_ in list(self._commands):
-            self._no_answer(id_, "lost")
+            self._no_answer(id_, LOST)
         if final:
-            self._end_all("lost", reason)
+            self._end_all(LOST, reason)
         else:
             self.connecting(now)
 
     def link_refused(self, now: float, refuse: m.Refuse) -> None:
         """The peer refuses us: every call ends, also those to come, until it welcomes us."""
-        was_up, self.up, self._held_until = self.up, False, None
-        self._refusal = f"{self.peer} refuses the connection: {refuse.code}: {refuse.text}"
+        was_up, self.up = self.up, False
+        away = self._absence.refuse(refuse.code, refuse.text)
         self._messages.clear()
         if was_up or self._pending or self._commands:
-            self._notices.append(PeerLost(self._refusal))
+            self._notices.append(PeerLost(away.text))
         for id_ in list(self._commands):
-            self._no_answer(id_, "refused")
-        self._end_all("refused", self._refusal)
+            self._no_answer(id_, REFUSED)
+        self._end_all(*away)
 
     def receive(self, now: float, message: m.Message) -> None:
         """Take a message of the peer; kinds that only a server is sent are left alone."""
@@ -316,9 +316,9 @@ class Caller:
 
     def advance(self, now: float) -> None:
         """End what has waited too long."""
-        if self._held_until is not None and now >= self._held_until:
-            self._held_until = None
-            self._end_all("lost", f"{self.peer} did not come back in {self._patience.reconnect:g} s")
+        away = self._absence.advance(now)
+        if away is not None:
+            self._end_all(*away)
         for id_ in self._pending.not_accepted(now):
             if self.up:
                 self._give_up(id_, "not_accepted", f"{self.peer} did not accept it in {self._patience.accept:g} s")
@@ -329,8 +329,8 @@ class Caller:
 
     def due(self) -> float | None:
         """When `advance` has something to do next (s), None if never."""
-        held_until = NEVER if self._held_until is None else self._held_until
-        self.soonest = soonest = min(self._pending.due(), self._settled.due, held_until, *self._commands.values())
+        waits = (self._pending.due(), self._settled.due, self._absence.until)
+        self.soonest = soonest = min(*waits, *self._commands.values())
         return soonest if soonest < NEVER else None
 
     @property
@@ -381,7 +381,7 @@ class Caller:
 
     def _end_all(self, cause: str, text: str) -> None:
         for id_, pending in list(self._pending.items()):
-            its = "unreachable" if cause == "lost" and not pending.sent else cause
+            its = UNREACHABLE if cause == LOST and not pending.sent else cause
             self._end(id_, its, text, m.Executed.UNKNOWN if pending.sent else pending.if_unsent)
 
     def _end(self, id_: str, cause: str, text: str, executed: m.Executed) -> None:

@@ -108,6 +108,8 @@ class Client:
         self.tls = tls
         self.trouble = ""
         """Why the last attempt to connect came to nothing; empty if it did not."""
+        self.answered = False
+        """Whether somebody answered the last attempt, be it by a refusal: then nobody needs to be launched there."""
         self.timing = timing or Timing()
         self.limits = limits or Limits()
         self.buffer = bytearray(READ_BUFFER)
@@ -257,9 +259,9 @@ class Client:
                     lambda: _ClientLink(self), self.host, self.port, ssl=self.tls, server_hostname=name
                 )
         except (OSError, TimeoutError) as fault:
-            self.trouble = self._said(fault)
+            self.trouble, self.answered = self._said(fault), isinstance(fault, ssl.SSLError)
             return None
-        self.trouble = ""
+        self.trouble, self.answered = "", True
         self._link = link
         return link
 

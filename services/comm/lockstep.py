@@ -24,6 +24,8 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Final
 
 from services.comm.cell import Cell, CellError, Delays, Half
+from services.comm.directory import COORDINATOR
+from services.comm.listening import cannot_listen
 from services.comm.messages import Bye, Hello, Message, Refuse, Tick, Welcome
 from services.comm.party import Party, Posted
 from services.comm.security import NONCE_BYTES, require_key
@@ -118,7 +120,8 @@ class Member:
         try:
             return socket.create_server((host, port), family=family(host), backlog=len(self._addresses))
         except OSError as fault:
-            raise CellError(f"{self.name}: cannot listen on {host}:{port}: {fault.strerror}") from None
+            key = COORDINATOR if self.name == COORDINATOR else f"nodes.{self.name}"
+            raise CellError(cannot_listen(key, host, port, fault)) from None
 
     def _connection(self, side: Side) -> Connection:
         nonce = secrets.token_bytes(NONCE_BYTES) if self._key is not None else b""

@@ -20,6 +20,8 @@ class Patience:
 
     reconnect: float = 2.0
     """After a broken link, before its calls end."""
+    again: float = 0.1
+    """Between two calls that are told at once that the peer is not there; those in between wait."""
     accept: float = 1.0
     """For ACCEPT."""
     stop: float = 5.0

@@ -293,7 +293,7 @@ def test_files_are_chosen_by_their_ending(tmp_path: Path) -> None:
     gspn = Gspn.of(queue(3), {"arrive": 1.0, "serve": 2.0})
     model = NetFile(gspn.net, "queue", gspn)
     for ending in (".pnml", ".net"):
-        text, lost = written(model, ending)
+        text, lost = written(model, Path(f"queue{ending}"))
         path = tmp_path / f"queue{ending}"
         path.write_text(text, encoding="utf-8")
         assert explore(read_net(path).net).edges == 6
@@ -301,10 +301,12 @@ def test_files_are_chosen_by_their_ending(tmp_path: Path) -> None:
     for path, said in ((tmp_path / "a.txt", "ending"), (tmp_path / "missing.pnml", "No such file")):
         with pytest.raises(FormatError, match=said):
             read_net(path)
-    with pytest.raises(FormatError, match="no writer"):
-        written(model, ".xyz")
-    with pytest.raises(FormatError, match="give rates"):
-        written(NetFile(gspn.net), ".drn")
+    with pytest.raises(FormatError, match=r"net\.xyz: file: no writer for the ending \.xyz; end its name in \.pnml"):
+        written(model, Path("net.xyz"))
+    with pytest.raises(FormatError, match="net: file: no writer for a file without ending"):
+        written(model, Path("net"))
+    with pytest.raises(FormatError, match=r"net\.drn: rates: .*give rates"):
+        written(NetFile(gspn.net), Path("net.drn"))
 
 
 def test_losses_are_listed() -> None:
@@ -315,9 +317,9 @@ def test_losses_are_listed() -> None:
 
 def test_dot_and_drn() -> None:
     gspn = Gspn.of(kanban(1), KANBAN_RATES)
-    dot, _ = written(NetFile(gspn.net, 'a "net"', gspn), ".dot")
+    dot, _ = written(NetFile(gspn.net, 'a "net"', gspn), Path("net.dot"))
     assert dot.count("->") == sum(map(len, (*gspn.net.consume, *gspn.net.produce))) and r"\"net\"" in dot
-    drn, _ = written(NetFile(gspn.net, gspn=gspn), ".drn")
+    drn, _ = written(NetFile(gspn.net, gspn=gspn), Path("net.drn"))
     assert "@nr_states\n160\n" in drn and drn.count("\taction 0") == 160
     rates = [float(line.split(":")[1]) for line in drn.splitlines() if line.startswith("\t\t")]
     chain = Chain.of(gspn)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
@@ -86,7 +88,7 @@ def test_pm4py_on_known_nets(pm4py: None, net: Net) -> None:
 def test_storm_reads_what_we_write_and_agrees(storm: None) -> None:
     """Through our .drn: its long-run shares are ours."""
     gspn = Gspn.of(kanban(1), KANBAN_RATES)
-    text = written(NetFile(gspn.net, gspn=gspn), ".drn")[0]
+    text = written(NetFile(gspn.net, gspn=gspn), Path("net.drn"))[0]
     for label in ("pkan1", "pm1", "pout4"):
         share = oracles.storm_share(text, label)
         assert long_run(Chain.of(gspn)).occupancy[label] == pytest.approx(share, abs=1e-5)
@@ -102,6 +104,6 @@ def test_storm_agrees_on_times(storm: None, tokens: int, rates: list[float]) -> 
     net = Net.build({**dict.fromkeys(names, 0), names[0]: tokens, "done": 0}, arcs)
     gspn = Gspn.of(net, {**{f"t{i}": rate for i, rate in enumerate(rates)}, "all": 3.0})
     chain = Chain.of(gspn)
-    text = written(NetFile(net, gspn=gspn), ".drn")[0]
+    text = written(NetFile(net, gspn=gspn), Path("net.drn"))[0]
     done = chain.space.where(lambda m: m[net.place_index["done"]] > 0)
     assert completion(chain, done).mean == pytest.approx(oracles.storm_time(text, "done"), rel=1e-4)

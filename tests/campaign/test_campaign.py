@@ -132,7 +132,7 @@ def test_a_manifest_that_was_cut_off_says_what_to_do(conduct: Conduct, size: int
         conduct("a", fails_at=0)
     path = plan_cut_off(whole.folder.parent / "a", size)
     with pytest.raises(
-        CampaignError, match=r"campaign.json is empty, torn.*remove campaign.json and give the command again"
+        CampaignError, match=r"campaign.json: .*empty, torn.*remove campaign.json and give the command again"
     ):
         conduct("a")
     path.unlink()

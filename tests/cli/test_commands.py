@@ -54,6 +54,28 @@ def test_overview_and_unknown_command(capsys: pytest.CaptureFixture[str]) -> Non
         (["replay", "no_such_run"], "no run 'no_such_run'"),
         (["new", "action", "2fast"], "2fast"),
         (["calibrate", "--views", "nowhere"], "nowhere"),
+        (["simulate", "catch_ball", "--replicas", "0"], "--replicas: 0 is not a whole number of at least 1"),
+        (["simulate", "catch_ball", "--replicas", "ten"], "ten is not a whole number of at least 1"),
+        (["simulate", "catch_ball", "--horizon", "-1"], "--horizon: -1 is not a number of more than 0"),
+        (["simulate", "catch_ball", "--seed", "-1"], "--seed: -1 is not a whole number of at least 0"),
+        (["analyse", "catch_ball", "--states", "0"], "--states: 0 is not a whole number of at least 1"),
+        (["analyse", "catch_ball", "--seconds", "-1"], "--seconds: -1 is not a number of at least 0"),
+        (["analyse", "catch_ball", "--seconds", "nan"], "--seconds: nan is not a number of at least 0"),
+        (["analyse", "catch_ball", "--memory", "0"], "--memory: 0 is not a whole number of at least 1"),
+        (["campaign", "catch_ball", "--runs", "abc"], "--runs: abc is not a whole number of at least 1"),
+        (["campaign", "catch_ball", "--target", "2"], "--target: 2 is not a number of more than 0 and at most 1"),
+        (["learned", "show", "x.db", "--target", "7"], "--target: 7 is not a number of more than 0 and at most 1"),
+        (["learned", "show", "x.db", "--rho", "-1"], "--rho: -1 is not a number of at least 0"),
+        (["token", "runs", "two"], "two changes nothing: write how many tokens"),
+        (["run", "catch_ball", "--runs", "abc"], "--runs: abc is not a whole number of at least 1"),
+        (["run", "catch_ball", "--keep", "0"], "--keep: 0 is not a whole number of at least 1"),
+        (["run", "catch_ball", "--target", "0"], "--target: 0 is not a number of more than 0 and at most 1"),
+        (["forecast", "catch_ball", "--replicates", "5"], "--replicates: 5 is not a whole number of at least 20"),
+        (["nodes", "--timeout", "-1"], "--timeout: -1: give seconds"),
+        (["nodes", "--timeout", "0"], "--timeout: 0: give seconds, more than 0"),
+        (["nodes", "--timeout", "inf"], "--timeout: inf: give seconds"),
+        (["up", "--lockstep", "--await-coordinator", "-1"], "--await-coordinator: -1: give seconds"),
+        (["up", "--lockstep", "--await-coordinator", "soon"], "--await-coordinator: soon: give seconds"),
     ],
 )
 def test_bad_input_is_exit_code_2_and_names_the_fault(
@@ -94,6 +116,23 @@ def test_a_node_ends_with_its_command(tmp_path: Path) -> None:
         assert node.wait(60.0) == 0
     with socket.socket() as again:
         assert again.connect_ex(("127.0.0.1", port)) != 0
+
+
+@pytest.mark.parametrize("command", [("run", "catch_ball", "--mode", "lockstep"), ("serve",), ("resume", "last")])
+@pytest.mark.parametrize("port", ["99999", "-1", "web"])
+def test_what_is_no_port_is_refused(command: tuple[str, ...], port: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """It is not taken for another number."""
+    assert main([*command, "--page-port", port]) == 2
+    said = capsys.readouterr().err
+    assert "--page-port" in said and "from 1 to 65535" in said
+
+
+def test_a_port_in_use_is_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One line with the remedy."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert main(["serve", "--page-port", str(port), "--tasks", str(tmp_path), "--journal", str(tmp_path)]) == 2
+    assert f"port {port}: Address already in use; choose another with --page-port" in capsys.readouterr().err
 
 
 def test_check_gives_its_findings_as_json(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -139,6 +178,8 @@ def test_a_task_that_can_deadlock_is_refused(tmp_path: Path, capsys: pytest.Capt
     assert "deadlock free NO" in capsys.readouterr().out
     assert main(["analyse", str(path)]) == 1
     assert "failed" in capsys.readouterr().out
+    assert main(["run", str(path), "--services", str(services), "--mode", "lockstep"]) == 1
+    assert "warning: stuck: deadlock free: " in capsys.readouterr().err
 
 
 def test_analyse_and_convert(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -193,6 +234,45 @@ def test_lockstep_run_writes_the_promised_file(tmp_path: Path) -> None:
     assert all({"n", "speed", "caught", "miss_mm", "status"} <= set(throw) for throw in results[0]["throws"])
     assert len(results[0]["throws"]) == 2
     assert {**results[0], "wall_s": 0} == {**results[1], "wall_s": 0}
+
+
+PRESSING = """\
+from services.action import error, success
+
+async def work(ctx, *, force=1.0):
+    return success() if force < 5.0 else error("too_strong")
+
+async def recover(ctx):
+    return error("no_power", "the robot has no power")
+"""
+
+
+def test_a_run_that_was_given_up_says_why(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An argument of a wrong type: its action, node and text stand in the terminal and in the JSON, and how to keep more."""
+    from coordinator.cli.new import TASK
+
+    monkeypatch.chdir(tmp_path)
+    broken = TASK.replace("{name}", "broken").replace("[places.work]", '[places.work]\nargs = { force = "x" }')
+    Path("pressing.py").write_text(PRESSING, encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    Path("broken.toml").write_text(broken, encoding="utf-8")
+    node = 'schema = 1\n[nodes.robot]\nhost = "127.0.0.1"\nport = 7399\n'
+    action = '[actions.{0}]\nrun = "pressing:{0}"\ntask = "{0}"\nnode = "robot"\n'
+    Path("services.toml").write_text(node + action.format("work") + action.format("recover"), encoding="utf-8")
+    assert main(["run", "broken.toml", "--mode", "lockstep", "--json", "out.json"]) == 1
+    said = capsys.readouterr()
+    work, recover = json.loads(Path("out.json").read_text(encoding="utf-8"))["last_errors"]
+    assert (work["run"], work["node"], recover["run"], recover["primitive_task"]) == (
+        ("work#1", "robot", "recover#1", "recover")
+    )
+    shown = "".join(said.out.split())
+    assert "TypeError" in work["text"] and recover["cause"] == "no_power"
+    for error in (work, recover):
+        assert "".join(f"{error['run']}, {error['action']} on robot".split()) in shown
+        assert "".join(error["text"].split()) in shown
+    assert "--journal" in said.err
 
 
 def test_a_task_of_ones_own_comes_before_a_shipped_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import stat
+import time
 from pathlib import Path
 
 import pytest
@@ -273,3 +274,14 @@ def test_the_door_of_a_killed_coordinator_is_no_door(tmp_path: Path) -> None:
     (tmp_path / "r" / DOOR).write_text(json.dumps(dead))
     with pytest.raises(NoRunError):
         find_door(folder=tmp_path)
+
+
+async def test_a_host_that_was_too_busy_is_told_with_the_result(petrobot: Terminal) -> None:
+    """The loop stood still for longer than any set point lives: what failed may be due to that."""
+    await petrobot.working()
+    until = time.monotonic() + 0.2
+    while time.monotonic() < until:
+        pass
+    assert (await petrobot("abort")).code == 0
+    await petrobot.until(lambda: bool(petrobot.mission.remarks))
+    assert "ms late" in petrobot.mission.result("realtime", 1.0)["host"]

@@ -121,6 +121,40 @@ def test_a_call_that_never_leaves_was_not_executed_unless_it_may_have_left_befor
     assert _ends(refused.notices()) == [("1", "refused", executed)]
 
 
+@pytest.mark.parametrize("refused", [False, True], ids=["not there", "refuses"])
+def test_who_tries_again_at_once_waits_a_little(refused: bool) -> None:
+    """A task that repeats what failed must not go round as fast as the machine can: two calls end in each tenth of a second."""
+    caller, cause = _caller(up=False), "refused" if refused else "unreachable"
+    if refused:
+        caller.link_refused(0.0, m.Refuse("keys", "copy the key"))
+        caller.notices()
+    ended: list[float] = []
+    now, number = 1.0, 0
+    while now < 2.0:
+        caller.call(now, m.Call(str(number), "move"))
+        if not caller.has_news:
+            due = caller.due()
+            assert due is not None and caller.soonest <= due
+            now = due
+            caller.advance(now)
+        assert _ends(caller.notices()) == [(str(number), cause, Executed.NO)]
+        ended.append(now)
+        number += 1
+        now += 0.001
+    assert 18 <= len(ended) <= 22
+
+
+def test_a_call_that_waits_to_be_tried_again_leaves_when_the_peer_is_there() -> None:
+    caller = _caller(up=False)
+    caller.call(1.0, CALL)
+    caller.call(1.01, m.Call("2", "move"))
+    caller.notices()
+    caller.link_up(1.05, _welcome())
+    assert [message.id for message in caller.messages() if isinstance(message, m.Call)] == ["2"]
+    caller.advance(1.2)
+    assert _ends(caller.notices()) == []
+
+
 def test_a_call_made_while_the_link_is_away_leaves_when_it_is_back_even_to_another_boot() -> None:
     caller = _caller()
     caller.link_down(1.0, "cut")

@@ -76,6 +76,9 @@ async def test_without_respawn_a_dead_one_stays_dead_and_the_end_of_all_is_notic
 async def test_one_that_does_not_come_up_is_named_with_the_end_of_its_log(tmp_path: Path) -> None:
     with pytest.raises(LaunchError, match=r"node a ended; its log .*a\.log ends with:\nno device at can0"):
         await Supervisor([program("a", FAULTY), program("b", STEADY)], tmp_path).__aenter__()
+    with pytest.raises(LaunchError) as again:
+        await Supervisor([program("a", FAULTY)], tmp_path).__aenter__()
+    assert str(again.value).count("no device at can0") == 1, "what an earlier start left in the log is not its end"
 
 
 async def test_those_that_others_need_are_ready_first(tmp_path: Path) -> None:

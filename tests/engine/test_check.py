@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -238,6 +239,27 @@ def test_action_that_no_node_offers(task: Tasks) -> None:
     assert "'look_twice'" in finding.text and "did you mean 'look_twise'" in finding.text
     assert "unoffered" not in found(made, offers={"look_once": "vision", "look_twice": "vision"})
     assert "unoffered" not in found(made)
+    assert "to mine.toml, or" in found(made, offers={"look_once": "vision"}, source="mine.toml")["unoffered"].remedy
+
+
+@pytest.mark.parametrize(
+    ("said", "finds"),
+    [("look", False), ("take", False), ("lok", True), ("rest", True)],
+)
+def test_action_that_is_said_to_translate_another_primitive_task(task: Tasks, said: str, finds: bool) -> None:
+    net = {**A, "s": {"in": "b:normal", "out": "y"}, "f": {"in": "b:error", "out": "y"}}
+    made = task("a!=1 b! y", net, alternatives={"a": ("move",), "b": ("move",)})
+    both = dict(made.primitive_tasks)
+    names = dict(zip(both, ("look", "take"), strict=True))
+    renamed = {new: replace(both[old], name=new) for old, new in names.items()}
+    renamed["rest"] = replace(renamed["look"], name="rest", alternatives=("stand",))
+    places = {n: replace(p, task=names[p.task]) if p.task else p for n, p in made.places.items()}
+    made = replace(made, primitive_tasks=renamed, places=places)
+    report = check(made, {"move": "arm"}, translates={"move": said}, source="mine.toml")
+    found = [f for f in report.findings if f.code == "translates-other"]
+    assert bool(found) is finds and report.ok
+    assert all(f.severity is W and f.key == "primitive_tasks.look.alternatives" for f in found)
+    assert all("mine.toml says" in f.text and repr(said) in f.text and "'look' or 'take'" in f.remedy for f in found)
 
 
 def test_honest_end_at_start(task: Tasks) -> None:

@@ -171,9 +171,30 @@ def test_all_faults_come_at_once_with_their_lines() -> None:
     assert numbered[lines["transitions.found.in"] - 1] == 'in = ["lok:normal"]'
 
 
+@pytest.mark.parametrize(
+    ("text", "key", "line"),
+    [
+        (GOOD.replace("[events.tick]", "[event.tick]"), "event", "[event.tick]"),
+        (GOOD.replace("[task.parameters]", "[task.parametres]"), "task.parametres", "[task.parametres]"),
+        (GOOD.replace("[events.tick]", "[[events.tick]]"), "events.tick", "[[events.tick]]"),
+        (GOOD.replace("schema = 1", "schema = 2"), "schema", "schema = 2"),
+        ("# nothing\nschema = 1\n", "task.name", "# nothing"),
+        ("schema = 1\nplaces = 3\n[task]\n", "places", "places = 3"),
+        ("schema = 1\nevent.tick.scope = 'x'\n", "event", "event.tick.scope = 'x'"),
+    ],
+)
+def test_faults_of_whole_tables_have_lines(text: str, key: str, line: str) -> None:
+    with pytest.raises(TaskFileError) as caught:
+        loads(text)
+    lines = dict(zip([f.key for f in caught.value.faults], caught.value.lines, strict=True))
+    assert text.splitlines()[lines[key] - 1] == line
+
+
 def test_broken_toml_says_where() -> None:
     with pytest.raises(TaskFileError, match=r"x\.toml:2: TOML: .*line 2"):
         loads("schema = 1\nname = = 2\n", "x.toml")
+    with pytest.raises(TaskFileError, match=r"x\.toml:2: TOML: .*end of document"):
+        loads("schema = 1\nname = ", "x.toml")
 
 
 @pytest.mark.parametrize("data", [b"\xff\xfe", b"schema = 1\n# \xff"])
@@ -326,6 +347,27 @@ def test_faults_of_subnets(old: str, new: str, words: str) -> None:
     assert old in SUBNET
     with pytest.raises(TaskFileError, match=words):
         loads(SUBNET.replace(old, new, 1))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "key", "line"),
+    [
+        ('subnet = "once"', 'subnet = "twice"', "subnets.twice.places.second.subnet", 'subnet = "twice"'),
+        (
+            "when = \"first.status == 'success'\"",
+            'when = "first.status == 1"',
+            "subnets.twice.transitions.next.when",
+            'when = "first.status == 1"',
+        ),
+    ],
+)
+def test_faults_within_subnets_have_their_lines(old: str, new: str, key: str, line: str) -> None:
+    text = SUBNET.replace(old, new, 1)
+    with pytest.raises(TaskFileError) as caught:
+        loads(text)
+    lines = dict(zip([f.key for f in caught.value.faults], caught.value.lines, strict=True))
+    assert text.splitlines()[lines[key] - 1] == line
+    assert lines[key] > text.splitlines().index("[subnets.twice]")
 
 
 def test_example_of_the_documentation_is_a_sound_task() -> None:

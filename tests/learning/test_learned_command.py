@@ -154,7 +154,7 @@ def test_without_learn_nothing_is_read_or_changed(cell: Path) -> None:
         (["--learn", "mock.toml"], "not a database"),
         (["--learn", "learned.db", "--context", "speed"], "no parameter or variable 'speed'"),
         (["--learn", "learned.db", "--selector", "greedy"], "invalid choice"),
-        (["--learn", "learned.db", "--target", "7"], "no reliability"),
+        (["--learn", "learned.db", "--target", "7"], "--target: 7 is not a number of more than 0 and at most 1"),
     ],
 )
 def test_bad_input_is_refused(cell: Path, arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -194,9 +194,9 @@ def test_verbs_of_learned(cell: Path, capsys: pytest.CaptureFixture[str]) -> Non
         (["show", "one.db", "--cost", "value:"], "no cost measure"),
         (["show", "two.db", "--cost", "value:nosuch"], "the results have: value:tries, value:weight"),
         (["show", "two.db", "pick", "--cost", "value:tries"], "the results have: value:weight"),
-        (["show", "one.db", "--target", "7"], "--target: 7 is no reliability"),
-        (["show", "one.db", "--rho", "-3"], "--rho: -3 is no weight"),
-        (["show", "one.db", "--budget", "nan"], "--budget: nan is no weight or cost"),
+        (["show", "one.db", "--target", "7"], "7 is not a number of more than 0 and at most 1"),
+        (["show", "one.db", "--rho", "-3"], "-3 is not a number of at least 0"),
+        (["show", "one.db", "--budget", "nan"], "nan is not a number of more than 0"),
         (["show", "one.db", "--context", "nowhere"], "knows the contexts 'regime=A'"),
         (["task", "one.db", str(TASK_FILE), "--context", "nowhere"], "knows the contexts 'regime=A'"),
     ):

@@ -81,6 +81,21 @@ def test_an_arm_that_cannot_be_recovered_ends_the_task_in_error(catch_ball: Task
     assert sum(r.place == "recover_arm" for r in mission.tally.runs) == 4
 
 
+def test_a_run_given_up_says_which_actions_erred_where_and_why(catch_ball: Task) -> None:
+    """What led there, the last one last; a run that reached its final marking has nothing of the kind."""
+    lines = {"move_to_point": [failing("bad_arguments")], "recover_arm": [failing("drive_fault")]}
+    mission, _ = run(catch_ball, lines)
+    told = mission.result("lockstep", 0.0)["last_errors"]
+    assert [(e["primitive_task"], e["cause"]) for e in told] == [
+        ("move_to_point", "bad_arguments"),
+        *[("recover_arm", "drive_fault")] * 4,
+    ]
+    where = mission.executor.directory.where
+    assert all(e["node"] == where(e["action"]) and e["run"].startswith(e["primitive_task"]) for e in told)
+    good, _ = run(catch_ball, {"move_to_point": [failing("bad_arguments"), GOOD, GOOD, GOOD]})
+    assert "last_errors" not in good.result("lockstep", 0.0)
+
+
 def test_failure_goes_on_along_the_normal_branch(catch_ball: Task) -> None:
     """A ball that passes is a failure: the run was used up, nothing is recovered."""
     mission, timeline = run(catch_ball, {"catch_ball": [failing("missed", ActionStatus.FAILURE)]})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import signal
+import socket
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
@@ -161,6 +162,23 @@ def test_two_buses_or_cameras_are_one_too_many(tmp_path: Path, extra: str, says:
 
 
 # Processes
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("taken", ["node", "bus", "camera"])
+def test_an_address_that_is_taken_is_told_by_file_address_and_remedy(tmp_path: Path, taken: str) -> None:
+    """A second laboratory would meet all three."""
+    file = services_file(tmp_path)
+    directory = load(file)
+    camera = camera_address(directory)
+    assert camera is not None
+    bus = bus_channel(directory)
+    port = {"node": directory.nodes["laboratory"].port, "bus": int(bus.rpartition(":")[2]), "camera": camera[1]}[taken]
+    with socket.create_server(("127.0.0.1", port)):
+        process = program("--services", str(file))
+        _, said = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 2
+    assert f"python -m sim: {file}: " in said and str(port) in said and "or give another port" in said
 
 
 @pytest.mark.processes

@@ -36,7 +36,10 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _change(text: str) -> int:
-    value = int(text)
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
     if not value:
-        raise argparse.ArgumentTypeError("0 tokens change nothing: write +1 or -1")
+        raise argparse.ArgumentTypeError(f"{text} changes nothing: write how many tokens more or fewer, as +1 or -1")
     return value

@@ -1,0 +1,161 @@
+"""What commands say of bad input: the file, where there is one its line, the key, and the remedy; never an exception's name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from coordinator.cli import COMMANDS, main
+from coordinator.cli.new import TASK
+
+SHIPPED = str(Path(__file__).parents[2] / "services.toml")
+WORK = TASK.replace("{name}", "work")
+CELL = """\
+schema = 1
+[nodes.robot]
+host = "127.0.0.1"
+port = 7399
+[actions.work]
+run = "services.action:success"
+task = "work"
+node = "robot"
+[actions.recover]
+run = "services.action:success"
+task = "recover"
+node = "robot"
+"""
+NO_CELL = "astray.toml:5: task.services: no such file: no.toml; name one relative to astray.toml, drop the key, or give --services"
+Petrobot = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def petrobot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Petrobot:
+    """Runs a command where work.toml, services.toml and other files lie; gives code, standard output and errors."""
+    monkeypatch.chdir(tmp_path)
+    files: dict[str, str | bytes] = {
+        "work.toml": WORK,
+        "astray.toml": WORK.replace("[task]", '[task]\nservices = "no.toml"'),
+        "folder.toml": WORK.replace("[task]", '[task]\nservices = "."'),
+        "binary.toml": b"schema = 1\n\xff\xfe\n",
+        "services.toml": CELL,
+        "rates.toml": "[rates]\n",
+        "mock.toml": "schema = 1\n[actions.work]\nseconds = 1\n[[actions.recovre]]\nseconds = 1\n",
+        "list.json": "[]",
+        "result.json": "[]",
+        "campaign.json": '{"schema": 1}',
+    }
+    for name, content in files.items():
+        Path(name).write_bytes(content if isinstance(content, bytes) else content.encode())
+
+    def run(*arguments: str) -> tuple[int, str, str]:
+        capsys.readouterr()
+        code = main(arguments)
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("check astray.toml", NO_CELL),
+        ("check astray.toml --live", NO_CELL),
+        ("run astray.toml", NO_CELL),
+        ("campaign astray.toml", NO_CELL),
+        ("check folder.toml", "folder.toml:5: task.services: . is no file"),
+        (
+            "analyse work.toml --rates nope.toml",
+            "--rates: nope.toml: work is a task; rates are for net files; leave it out",
+        ),
+        ("analyse work.toml --view gspn --rates rates.toml", "--rates: rates.toml: work is a task"),
+        ("simulate work.toml --rates unit", "--rates: unit: work is a task"),
+        ("analyse binary.toml", "petrobot analyse: binary.toml:2: file: is not UTF-8"),
+        ("simulate binary.toml", "petrobot simulate: binary.toml:2: file: is not UTF-8"),
+        ("convert binary.toml x.pnml", "petrobot convert: binary.toml:2: file: is not UTF-8"),
+        (
+            "convert work.toml x.foo",
+            "x.foo: file: no writer for the ending .foo; end its name in .pnml, .net, .dot, .drn",
+        ),
+        ("new action class", "'class' is a word of Python itself (a keyword)"),
+        ("new action Fast", "use small letters, digits and _"),
+        (
+            "run work.toml --mode lockstep --mock mock.toml",
+            "mock.toml:4: actions.recovre: services.toml has no such action",
+        ),
+        ("check work.toml --services no.toml", "no.toml: No such file or directory; give --services a location file"),
+        ("campaign work.toml --mock no.toml", "no.toml: No such file or directory; give --mock a file of scripted"),
+        ("campaign work.toml --mock mock.toml", "(did you mean 'recover'?); name one of its actions, or drop it here"),
+        (
+            "forecast --compare a b",
+            "a is no forecast: No such file or directory; give a file that `petrobot forecast --out",
+        ),
+        ("forecast --compare work.toml b", "work.toml is no forecast: it is no JSON"),
+        ("forecast --compare list.json b", "list.json is no forecast: a table with schema and sha256 is missing"),
+        ("forecast work.toml --estimates .", "campaign.json: the key 'regimes' is missing"),
+        ("campaign work.toml --learned nope", "no finished campaign: No such file or directory; give the folder of"),
+        ("campaign work.toml --learned .", "result.json: no result of a campaign: selector and policy are missing"),
+        ("campaign --resume work.toml", "work.toml holds no campaign: campaign.json is missing; give a folder that"),
+    ],
+)
+def test_bad_input_names_file_key_and_remedy(command: str, said: str, petrobot: Petrobot) -> None:
+    """Exit code 2; nothing of it on standard output, and no exception in it."""
+    code, out, err = petrobot(*command.split())
+    assert (code, out) == (2, "")
+    assert said in err
+    assert "Error(" not in err and "Errno" not in err
+
+
+def test_a_cell_that_was_not_given_is_named(petrobot: Petrobot) -> None:
+    """Without services.toml here the shipped one is judged by, and said to be."""
+    assert petrobot("check", "work.toml")[0] == 0
+    Path("services.toml").unlink()
+    code, out, _ = petrobot("check", "work.toml")
+    assert code == 2
+    assert f"add [actions.work] to {SHIPPED}, or drop it here" in out
+    assert f"services.toml: there is none here, so {SHIPPED} was used" in out
+
+
+def test_an_action_that_translates_another_task_is_told(petrobot: Petrobot) -> None:
+    """It may run all the same."""
+    Path("services.toml").write_text(CELL.replace('task = "work"', 'task = "wrok"'), encoding="utf-8")
+    code, out, _ = petrobot("check", "work.toml")
+    assert code == 0
+    assert (
+        "warning work.toml:13: primitive_tasks.work.alternatives: services.toml says that the action 'work' translates 'wrok'"
+        in out
+    )
+    assert "write task = 'work' in its [actions.work]" in out
+
+
+def test_check_does_not_promise_what_analyse_does_not_do(petrobot: Petrobot) -> None:
+    """Neither goes on when the net has no end; where only the limit is near, `analyse` does."""
+    endless = WORK.replace('out = ["robot_free"]', 'out = ["robot_free", "runs*2"]', 1)
+    Path("work.toml").write_text(endless, encoding="utf-8")
+    code, out, _ = petrobot("check", "work.toml")
+    assert code == 2 and "bounded NO" in out
+    assert "cut short (it has no end: the net is unbounded)" in out and "goes on longer" not in out
+
+
+def test_a_search_that_was_cut_short_may_go_on(petrobot: Petrobot, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a limit ended it, `analyse` has a larger one."""
+    monkeypatch.setattr("coordinator.cli.check.MOST_STATES", 4)
+    out = petrobot("check", "work.toml")[1]
+    assert "petrobot analyse goes on longer" in out
+
+
+@pytest.mark.parametrize("name", [command.name for command in COMMANDS])
+def test_help_says_which_location_file(name: str, petrobot: Petrobot) -> None:
+    """The task's own comes first."""
+    out = " ".join(petrobot(name, "--help")[1].split())
+    assert "--services FILE the" not in out or "the one that the task names in `services`" in out
+
+
+def test_exit_codes_are_told(petrobot: Petrobot) -> None:
+    """Also what 1 means of commands that run nothing."""
+    code, out, _ = petrobot("--help")
+    assert code == 0
+    told = out.partition("exit codes:")[2]
+    assert all(word in told for word in ("analyse refuses", "forecast disagrees", "operator's command", "3 a node"))

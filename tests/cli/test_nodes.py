@@ -1,0 +1,78 @@
+"""`petrobot nodes` and `estop` against a node with a device and actions that need none: what is called a device, and how it is."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import pytest_asyncio
+
+from coordinator.cli import main
+from services.comm.directory import Directory
+from services.node import GENERAL, Node
+from services.place import InlinePlace
+from tests.cli.cell import Arm, directory_in
+from tests.in_loop import NodeInLoop
+
+STOPPED = "arm stopped (petrobot estop --clear)"
+
+
+@pytest_asyncio.fixture
+async def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Directory]:
+    """The location file of a node that runs in this loop."""
+    monkeypatch.setenv("COLUMNS", "200")
+    directory = directory_in(tmp_path)
+    clock = asyncio.get_running_loop().time
+    arm = InlinePlace(directory.actions, clock=clock, driver=Arm({}, None))
+    places = {"arm": arm, GENERAL: InlinePlace(directory.actions, clock=clock)}
+    node = NodeInLoop(Node(directory, "robot", boot="b1", clock=clock, places=places), directory.address("robot"))
+    await node.start()
+    yield directory
+    await node.close()
+
+
+async def said(directory: Directory, capsys: pytest.CaptureFixture[str], *command: str) -> str:
+    """What a command prints that does its work."""
+    capsys.readouterr()
+    code = await asyncio.to_thread(main, [*command, "--services", str(directory.source)])
+    assert code == 0, capsys.readouterr().err
+    return capsys.readouterr().out
+
+
+async def test_a_node_is_no_device_of_its_own(directory: Directory, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its actions without a device answer under its name; a table of devices leaves that out."""
+    stopped = json.loads(await said(directory, capsys, "estop", "--json", "-"))
+    assert stopped["nodes"][0]["devices"] == {"arm": "stopped"}
+    status: dict[str, Any] = json.loads(await said(directory, capsys, "nodes", "--json", "-"))["robot"]["status"]
+    assert set(status["devices"]) == set(status["answers"]) == {"arm"}
+    assert status["general"]["runs"] == []
+
+
+async def test_stopped_devices_are_shown_until_they_are_cleared(
+    directory: Directory, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In the table with the remedy, and as data."""
+    assert "stopped" not in await said(directory, capsys, "nodes")
+    assert "stopped" not in json.loads(await said(directory, capsys, "nodes", "--json", "-"))["robot"]
+    await said(directory, capsys, "estop")
+    assert STOPPED in await said(directory, capsys, "nodes")
+    assert json.loads(await said(directory, capsys, "nodes", "--json", "-"))["robot"]["stopped"] == ["arm"]
+    await said(directory, capsys, "estop", "--clear")
+    assert "stopped" not in await said(directory, capsys, "nodes")
+
+
+def test_the_stop_of_a_node_that_does_not_run_is_shown_too(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As this host's disk says: it would come up stopped."""
+    monkeypatch.setenv("COLUMNS", "200")
+    services = str(directory_in(tmp_path).source)
+    assert main(["estop", "--services", services]) == 3
+    capsys.readouterr()
+    assert main(["nodes", "--services", services, "--timeout", "0.2"]) == 3
+    shown = capsys.readouterr().out
+    assert "away" in shown and STOPPED in shown
