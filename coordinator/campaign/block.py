@@ -15,6 +15,7 @@ from coordinator.campaign.plan import Block, CampaignError, Plan, digest
 from coordinator.campaign.throws import CostOf, ThrowLog
 from coordinator.engine.instructions import RunRecorded
 from coordinator.launch import SCRIPTED, Setting, load_object, lockstep_mission, lockstep_party
+from coordinator.learning.estimate import COUNT
 from coordinator.mission.lockstep_party import CoordinatorParty
 from coordinator.mission.mission import Mission, MissionError
 from coordinator.task import Task
@@ -150,7 +151,7 @@ def costs(task: Task, directory: Directory) -> CostOf:
         if measure == "cpu":
             entry = directory.actions.get(record.action)
             return None if entry is None else entry.compute_time
-        value = values.get(measure.partition(":")[2])
+        value = values.get(COUNT, 1) if measure == COUNT else values.get(measure.partition(":")[2])
         return float(value) if isinstance(value, bool | int | float) else None
 
     return cost

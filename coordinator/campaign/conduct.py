@@ -16,6 +16,8 @@ from typing import Any, Protocol
 from coordinator.campaign.block import PLOTS, Bench
 from coordinator.campaign.observed import write_estimates
 from coordinator.campaign.plan import (
+    MANIFEST,
+    TABLE,
     Block,
     CampaignError,
     Plan,
@@ -23,12 +25,13 @@ from coordinator.campaign.plan import (
     identity,
     read_manifest,
     write_manifest,
+    write_whole,
 )
 from coordinator.campaign.policies import Policy, policy_of
 from coordinator.campaign.rows import Row, rows_of
 from coordinator.campaign.spent import note_block, note_sessions, sessions
 from coordinator.campaign.summary import Summary, result_of
-from coordinator.campaign.table import TABLE, Table
+from coordinator.campaign.table import Table
 
 AHEAD = 3
 """Blocks handed out beyond those that the workers are busy with, so that none waits while a slow one is awaited."""
@@ -67,7 +70,7 @@ def open_folder(folder: Path, plan: Plan) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as fault:
         raise CampaignError(f"{folder}: {fault.strerror or fault}; give --out a folder that can be written") from fault
-    if (folder / TABLE).exists() or (folder / "campaign.json").exists():
+    if (folder / TABLE).exists() or (folder / MANIFEST).exists():
         other = differences(read_manifest(folder), plan)
         if other:
             raise CampaignError(f"{folder} holds another campaign: {', '.join(other)} differ; give another --out")
@@ -130,8 +133,8 @@ class Campaign:
     def result(self) -> dict[str, Any]:
         """The result so far, as the command line writes it; the estimates file is written beside the table."""
         name = identity(self.plan)
-        summary = Summary.of(self.bench.task, self.table.rows(), name)
-        write_estimates(self.folder, summary.estimates, self.policy.selectors(), f"campaign/{name}")
+        summary = Summary.of(self.bench.task, self.table.rows(), name, self.plan.options)
+        write_estimates(self.folder, summary.estimates, self.policy.selectors(), name, summary.asked())
         return result_of(self.folder, self.plan, summary, self.policy.state())
 
     async def _results(self, pool: Pool, orders: Iterator[tuple[Block, dict[str, Any]]]) -> AsyncIterator[list[Row]]:
@@ -162,7 +165,7 @@ class Campaign:
         rows = rows_of(block, result)
         plots = self.folder / f"{PLOTS}.json"
         if result[PLOTS] and not plots.exists():
-            plots.write_text(json.dumps(result[PLOTS], indent=2) + "\n", encoding="utf-8")
+            write_whole(plots, json.dumps(result[PLOTS], indent=2) + "\n")
         note_block(self.folder, block, result)
         self._note_session(pool)
         self.table.append(rows)

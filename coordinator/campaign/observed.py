@@ -6,11 +6,14 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from coordinator.campaign.plan import CampaignError
 from coordinator.campaign.rows import Row
 from coordinator.campaign.throws import RunEntry
-from coordinator.experience.estimates_file import EstimatesFile
+from coordinator.experience.estimates_file import EstimatesError, EstimatesFile
+from coordinator.experience.estimates_tables import CAMPAIGN
 from coordinator.learning.estimate import Key, Observation, Tally
 from coordinator.learning.learning import Estimates
+from coordinator.learning.objective import Question
 from coordinator.learning.passage import Flow, PassageKey
 from coordinator.task import Executed, Status, Task
 
@@ -33,7 +36,7 @@ def observation(task: Task, run: RunEntry) -> Observation:
     preempted = run.cancelled and bool(run.taken)
     return Observation(
         Status(run.status) if run.status else None,
-        run.took if preempted else run.seconds,
+        run.took if preempted else max(0.0, run.seconds),
         run.cause,
         Executed(run.executed),
         run.cost if measure == "cpu" else None,
@@ -73,10 +76,21 @@ def estimates_of(task: Task, rows: Iterable[Row], salt: str) -> Estimates:
 
 
 def write_estimates(
-    folder: Path, estimates: Estimates, selectors: Mapping[str, Mapping[str, Any]], origin: str
+    folder: Path,
+    estimates: Estimates,
+    selectors: Mapping[str, Mapping[str, Any]],
+    campaign: str,
+    asked: Mapping[str, Question] | None = None,
 ) -> Path:
-    """Write the campaign's estimates file anew; its origin is the campaign's own, so merging it twice counts nothing twice."""
+    """Write the campaign's runs into its estimates file, under an origin of the campaign's own.
+
+    So merging it twice counts nothing twice, and what others have learned into the file stays. `asked`: by what the actions of
+    each primitive task are judged. Raises CampaignError.
+    """
     path = folder / ESTIMATES
-    path.unlink(missing_ok=True)
-    EstimatesFile(path, origin).add(estimates, selectors)
+    try:
+        origin = CAMPAIGN + campaign
+        EstimatesFile(path, origin).put_closed(origin, estimates, selectors, asked or {})
+    except EstimatesError as fault:
+        raise CampaignError(f"{fault}. If it is removed, the same command makes it again from the table") from fault
     return path

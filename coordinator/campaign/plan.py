@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,6 +17,7 @@ from typing import Any
 SEEDS = 1_000_000
 """Mission seeds of one campaign seed."""
 MANIFEST = "campaign.json"
+TABLE = "table.csv"
 SCHEMA = 1
 
 
@@ -120,26 +122,52 @@ def digest(path: Path | str) -> str:
         raise CampaignError(f"{path}: {fault.strerror or fault}") from fault
 
 
+def write_whole(path: Path, text: str) -> None:
+    """Write a file so that a kill or a power cut leaves the old one or the new one, never a part."""
+    draft = path.with_name(f"{path.name}.new")
+    with draft.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    draft.replace(path)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)  # the new name is on the disk before anything relies on it
+    finally:
+        os.close(folder)
+
+
 def write_manifest(folder: Path, plan: Plan) -> None:
     """Keep the plan beside its table."""
-    text = json.dumps(plan.to_plain(), indent=2) + "\n"
-    (folder / MANIFEST).write_text(text, encoding="utf-8")
+    write_whole(folder / MANIFEST, json.dumps(plan.to_plain(), indent=2) + "\n")
 
 
 def read_manifest(folder: Path) -> Plan:
     """The plan of a campaign's folder. Raises CampaignError."""
     path = folder / MANIFEST
     try:
-        return Plan.from_plain(json.loads(path.read_text(encoding="utf-8")))
+        data = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(data, Mapping):
+            raise ValueError(f"a {type(data).__name__} is no plan")
+        return Plan.from_plain(data)
     except (FileNotFoundError, NotADirectoryError) as fault:
         remedy = "give a folder that `petrobot campaign --out FOLDER` wrote"
         raise CampaignError(f"{folder} holds no campaign: {MANIFEST} is missing; {remedy}") from fault
     except OSError as fault:
         raise CampaignError(f"{path}: {fault.strerror or fault}") from fault
-    except KeyError as fault:
-        raise CampaignError(f"{path}: the key {fault} is missing; was it written by `petrobot campaign`?") from fault
-    except (ValueError, TypeError, AttributeError) as fault:
-        raise CampaignError(f"{path}: {fault}; was it written by `petrobot campaign`?") from fault
+    except (KeyError, ValueError, TypeError, AttributeError) as fault:
+        said = f"the key {fault} is missing" if isinstance(fault, KeyError) else str(fault)
+        raise CampaignError(f"{path}: {said}; it is empty, torn or no plan: {_remedy(folder)}") from fault
+
+
+def _remedy(folder: Path) -> str:
+    """What to do about a manifest that cannot be read."""
+    if not (folder / TABLE).exists():
+        return f"no run stands in {folder} yet: remove {MANIFEST} and give the command again"
+    return (
+        f"put it back from a copy, remove {folder} to begin anew, or give another --out "
+        f"(what {TABLE} was made with is not known without it)"
+    )
 
 
 def differences(old: Plan, new: Plan) -> list[str]:

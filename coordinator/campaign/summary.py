@@ -10,16 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from coordinator.campaign.observed import ESTIMATES, add_row, context_of
-from coordinator.campaign.plan import Plan
+from coordinator.campaign.observed import ESTIMATES, add_row, context_of, regime_of
+from coordinator.campaign.plan import TABLE, Plan
 from coordinator.campaign.rows import Row
 from coordinator.campaign.spent import sessions, times
-from coordinator.campaign.table import TABLE
 from coordinator.learning.estimate import Key, Tally
 from coordinator.learning.intervals import wilson
 from coordinator.learning.learning import Estimates
 from coordinator.learning.objective import Comparison, Question, compare
-from coordinator.task import Task
+from coordinator.task import PrimitiveTask, Task
 
 
 @dataclass
@@ -68,8 +67,22 @@ def _share(part: int, whole: int) -> float | None:
     return round(part / whole, 6) if whole else None
 
 
-def comparisons(task: Task, tallies: Mapping[Key, Tally], regime: str | None = None) -> dict[str, Comparison]:
-    """By primitive task: all its alternatives with runs judged together, over all regimes or in one."""
+def question_of(primitive: PrimitiveTask, options: Mapping[str, Any], declared: bool = True) -> Question:
+    """What is asked of a primitive task's actions: target and rho as a plan's options give them.
+
+    Without a target in the options it is the one that the task file declares, unless `declared` is off.
+    """
+    target = options.get("target", primitive.target_reliability if declared else None)
+    return Question(primitive.cost, target, options.get("rho"))
+
+
+def comparisons(
+    task: Task, tallies: Mapping[Key, Tally], regime: str | None = None, options: Mapping[str, Any] | None = None
+) -> dict[str, Comparison]:
+    """By primitive task: all its alternatives with runs judged together, over all regimes as scenarios or in one.
+
+    `options`: those of the campaign's plan. In one regime a target counts only if it was given (as in `Learning.comparison`).
+    """
     out = {}
     for primitive in task.primitive_tasks.values():
         by_action: dict[str, dict[str, Tally]] = {}
@@ -78,7 +91,7 @@ def comparisons(task: Task, tallies: Mapping[Key, Tally], regime: str | None = N
                 by_action.setdefault(key.action, {})[key.context] = tally
         if by_action:
             ordered = {a: by_action[a] for a in primitive.alternatives if a in by_action}
-            out[primitive.name] = compare(ordered, Question(primitive.cost))
+            out[primitive.name] = compare(ordered, question_of(primitive, options or {}, regime is None))
     return out
 
 
@@ -92,12 +105,14 @@ class Summary:
     chosen: dict[str, dict[str, int]] = field(default_factory=dict)
     estimates: Estimates = field(default_factory=Estimates)
     salt: str = ""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """Of the campaign's plan: target reliability and rho, where they were given."""
     mission_s: dict[int, float] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, task: Task, rows: Iterable[Row], salt: str = "") -> Summary:
-        """Of a table's rows. `salt` names the campaign in the estimates."""
-        made = cls(task, salt=salt)
+    def of(cls, task: Task, rows: Iterable[Row], salt: str = "", options: Mapping[str, Any] | None = None) -> Summary:
+        """Of a table's rows. `salt` names the campaign in the estimates; `options` are its plan's."""
+        made = cls(task, salt=salt, options=options or {})
         for row in rows:
             made.add(row)
         return made
@@ -113,19 +128,35 @@ class Summary:
             actions[run.action] = actions.get(run.action, 0) + 1
         add_row(self.estimates, self.task, row, self.salt)
 
-    def objectives(self) -> dict[str, dict[str, float | None]]:
-        """J of each action, one rho for each primitive task."""
-        found = comparisons(self.task, self.estimates.tallies)
-        return {task: {f.action: _finite(f.j) for f in judged.figures} for task, judged in found.items()}
+    def asked(self) -> dict[str, Question]:
+        """By what the actions of each primitive task are judged."""
+        return {p.name: question_of(p, self.options) for p in self.task.primitive_tasks.values()}
+
+    def comparisons(self) -> dict[str, Comparison]:
+        """The actions of each primitive task judged over all regimes, as the campaign's options ask."""
+        return comparisons(self.task, self.estimates.tallies, options=self.options)
+
+    def _judged(self, name: str, found: Comparison) -> dict[str, Any]:
+        """What J of a primitive task was made with: measure, target, rho, regimes, who meets the target where."""
+        asked = question_of(self.task.primitive_tasks[name], self.options)
+        return {
+            "cost": asked.measure,
+            "target": asked.target,
+            "rho": round(found.rho, 9),
+            "regimes": [regime_of(s) for s in found.scenarios],
+            "meet_target": {f.action: [regime_of(s) for s in f.scenarios] for f in found.figures if f.admissible},
+            "uncosted": list(found.uncosted),
+        }
 
     def to_plain(self) -> dict[str, Any]:
         """Plain data."""
-        has_goal = bool(self.task.goal_transitions)
+        has_goal, found = bool(self.task.goal_transitions), self.comparisons()
         return {
             **self.whole.to_plain(has_goal),
             "by_regime": {name: counts.to_plain(has_goal) for name, counts in self.by_regime.items()},
             "chosen": {t: dict(sorted(self.chosen[t].items())) for t in self.task.primitive_tasks if t in self.chosen},
-            "J": self.objectives(),
+            "J": {name: {f.action: _finite(f.j) for f in judged.figures} for name, judged in found.items()},
+            "judged": {name: self._judged(name, judged) for name, judged in found.items()},
             "sim_s": round(sum(self.mission_s.values()), 6),
         }
 

@@ -10,11 +10,11 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from coordinator.campaign.plan import TABLE as TABLE
 from coordinator.campaign.plan import Block, CampaignError
 from coordinator.campaign.rows import Row, cells, columns, read_row
 from coordinator.task import Task
 
-TABLE = "table.csv"
 PARQUET = "table.parquet"
 
 

@@ -44,10 +44,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--learned", metavar="CAMPAIGN", type=Path, help="the best actions that this campaign has learned"
     )
     parser.add_argument(
-        "--target", type=probability, metavar="R", help="learn among actions that reach this reliability"
+        "--target", type=probability, metavar="R", help="learn and judge by this reliability, not the declared one"
     )
     parser.add_argument(
-        "--rho", type=number(least=0.0), metavar="X", help="weight of cost when learning (1 / largest mean cost)"
+        "--rho", type=number(least=0.0), metavar="X", help="weight of cost in J (1 / largest mean cost)"
     )
     parser.add_argument(
         "--workers", type=whole(), default=os.cpu_count() or 1, metavar="K", help="processes (%(default)s)"
@@ -245,12 +245,32 @@ def text_of(result: dict[str, Any]) -> str:
         lines.append(f"  {name or '-':{wide}}{goal}P_complete {part['P_complete'] or 0.0:.4f}{times}")
     for task, actions in result["chosen"].items():
         if len(actions) > 1:
-            judged = result["J"].get(task, {})
-            shown = ", ".join(
-                f"{a} {n}" + (f" (J {judged[a]:.3f})" if judged.get(a) is not None else "") for a, n in actions.items()
-            )
+            shown = ", ".join(f"{a} {n}" + _in_brackets(result, task, a) for a, n in actions.items())
             lines.append(f"  {task:{wide}}{shown}")
+            lines += [f"  {'':{wide}}{remark}" for remark in _remarks(result["judged"].get(task, {}))]
     speed = result["times_real_time_per_core"]
     lines.append(f"  {result['sim_s']:.1f} s simulated in {result['wall_s']:.1f} s: {speed} x real time a core")
     lines.append(f"  table: {result['rows']}")
     return "\n".join(lines)
+
+
+def _in_brackets(result: dict[str, Any], task: str, action: str) -> str:
+    """J of an action, or why it has none."""
+    j, judged = result["J"].get(task, {}).get(action), result["judged"].get(task, {})
+    if j is not None:
+        return f" (J {j:.3f})"
+    if judged and judged["meet_target"] and action not in judged["meet_target"]:
+        return f" (below R {judged['target']:g})"
+    return ""
+
+
+def _remarks(judged: dict[str, Any]) -> list[str]:
+    """What J of a primitive task cannot say."""
+    out = []
+    if judged and not judged["meet_target"] and judged["target"] is not None:
+        out.append(f"no action surely reaches R {judged['target']:g} in any regime: J without a target")
+    if judged and not judged["regimes"]:
+        out.append("there is no regime in which all were run: J of each in its own regimes, not comparable")
+    for action in judged.get("uncosted", ()):
+        out.append(f"{action}: no run reported {judged['cost']}; its cost is taken as 0. Correct `cost` or the action")
+    return out

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import argparse
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,8 +13,6 @@ from coordinator.cli import CommandError
 from coordinator.cli.quantities import probability
 
 if TYPE_CHECKING:
-    import argparse
-
     from coordinator.experience.learning_session import LearningSession
     from coordinator.mission.partners import FirstAlternative
     from coordinator.task import Task
@@ -103,6 +103,12 @@ def _save(session: LearningSession, *, interrupted: bool) -> dict[str, Any]:
     except EstimatesError as fault:
         raise CommandError(2, str(fault)) from fault
     learning, values = session.learning, session.selector.context
+    for name, action, measure in learning.uncosted():
+        print(
+            f"{name}: no run of {action} reported {measure}, so its cost was taken as 0; correct `cost` in the task file or the "
+            "name in the action's result",
+            file=sys.stderr,
+        )
     return {
         "file": str(session.setting.path),
         "selector": session.setting.selector,

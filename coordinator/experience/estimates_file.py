@@ -3,7 +3,8 @@
 Every file has an origin of its own, and keeps the sums of each origin apart. A merge takes the later version of each origin's
 sums, so merging is idempotent, commutative and associative: no run counts twice, however often and in whatever order files
 travel. What was reset stays forgotten: its origins are remembered as such. A copy of a file becomes an origin of its own as soon
-as something is added to it, so two copies that both went on lose nothing when they meet.
+as something is added to it, so two copies that both went on lose nothing when they meet. A campaign's runs stand under an origin
+that is closed: it is the same in whatever file the campaign is counted, so nothing else is ever added to it.
 """
 
 from __future__ import annotations
@@ -12,43 +13,51 @@ import json
 import secrets
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from coordinator.learning.estimate import Key, Tally
+from coordinator.experience.estimates_tables import (
+    APPLICATION,
+    CHOICE,
+    COUNTED,
+    SCHEMA,
+    TABLES,
+    add_flow,
+    add_tally,
+    correct_tally,
+    count_session,
+    fact,
+    flow_of,
+    flow_row,
+    forget,
+    is_empty,
+    migrate,
+    put_question,
+    put_selector,
+    question_of,
+    questions,
+    renew_origin,
+    schema,
+    state_of,
+    take_later,
+    take_selector,
+    tally_of,
+    tally_row,
+)
+from coordinator.learning.estimate import Key
 from coordinator.learning.estimate import merge as merge_tallies
-from coordinator.learning.joining import joined, trials
-from coordinator.learning.learning import Estimates, corrected
-from coordinator.learning.moments import Moments
+from coordinator.learning.learning import Estimates
+from coordinator.learning.objective import Question
 from coordinator.learning.passage import Flow, PassageKey
 from coordinator.learning.passage import merge as merge_flows
 from coordinator.learning.records import Correction
 
-SCHEMA = 1
-APPLICATION = 0x70657472
-""""petr": SQLite's application_id of these files."""
 BUSY = 20.0
 """Seconds that a command waits for another one that is writing the file."""
 MACHINE_ID = Path("/etc/machine-id")
 """Tells machines apart (machine-id(5)); where there is none, the file's inode alone tells copies apart."""
-CHOICE = "choice of "
-"""Before a primitive task's name in the table `forgotten`: its selectors' states are forgotten, not its estimates."""
-COUNTED = "counted "
-"""Before a mission run's id in the table `about`: the origin under which its runs were counted when it was interrupted."""
-
-TABLES = """
-CREATE TABLE about(name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
-CREATE TABLE tally(origin TEXT, primitive_task TEXT, action TEXT, context TEXT, version INTEGER NOT NULL, body TEXT NOT NULL,
-  PRIMARY KEY(origin, primitive_task, action, context)) WITHOUT ROWID;
-CREATE TABLE flow(origin TEXT, task TEXT, transition_name TEXT, context TEXT, version INTEGER NOT NULL, body TEXT NOT NULL,
-  PRIMARY KEY(origin, task, transition_name, context)) WITHOUT ROWID;
-CREATE TABLE selector(primitive_task TEXT, name TEXT, trials REAL NOT NULL, state TEXT NOT NULL,
-  PRIMARY KEY(primitive_task, name)) WITHOUT ROWID;
-CREATE TABLE forgotten(origin TEXT, primitive_task TEXT, PRIMARY KEY(origin, primitive_task)) WITHOUT ROWID;
-CREATE TABLE mission(id TEXT PRIMARY KEY, records INTEGER NOT NULL) WITHOUT ROWID;
-"""
 
 
 class EstimatesError(Exception):
@@ -64,6 +73,16 @@ class Kept:
     """Mission runs learned from so far."""
     estimates: Estimates = field(default_factory=Estimates)
     selectors: dict[tuple[str, str], dict[str, Any]] = field(default_factory=dict)
+    asked: dict[str, tuple[Question, ...]] = field(default_factory=dict)
+    """By primitive task: cost measure, target and rho by which its actions were judged where they were run; several where
+    origins differ, the first one this file's own or else the one that was asked most often."""
+
+    def question(self, primitive_task: str) -> Question:
+        """By what the actions of a primitive task are judged if nothing else is asked."""
+        if self.asked.get(primitive_task):
+            return self.asked[primitive_task][0]
+        states = (state for (task, _), state in self.selectors.items() if task == primitive_task)
+        return Question(next((str(state["cost"]) for state in states if state.get("cost")), "wall"))
 
     def states(self, selector: str) -> dict[str, dict[str, Any]]:
         """States of one kind of selector by primitive task."""
@@ -88,18 +107,22 @@ class EstimatesFile:
             return self._kept(db)
 
     def _kept(self, db: sqlite3.Connection) -> Kept:
-        if _is_empty(db):  # made, but killed before anything was written
+        if is_empty(db):  # made, but killed before anything was written
             return Kept()
         about = dict(db.execute("SELECT name, value FROM about"))
         kept = Kept(about["origin"], int(about["generation"]))
-        for task, action, context, body in db.execute("SELECT primitive_task, action, context, body FROM tally"):
-            key = Key(task, action, context)
-            kept.estimates.tallies[key] = merge_tallies(kept.estimates.tally(key), _tally(body))
-        for task, name, context, body in db.execute("SELECT task, transition_name, context, body FROM flow"):
-            where = PassageKey(task, name, context)
-            kept.estimates.flows[where] = merge_flows(kept.estimates.flows.get(where, Flow()), _flow(body))
+        for row in db.execute("SELECT * FROM tally"):
+            key = Key(*row[1:4])
+            kept.estimates.tallies[key] = merge_tallies(kept.estimates.tally(key), tally_of(row))
+        for row in db.execute("SELECT * FROM flow"):
+            where = PassageKey(*row[1:4])
+            kept.estimates.flows[where] = merge_flows(kept.estimates.flows.get(where, Flow()), flow_of(row))
         for task, name, state in db.execute("SELECT primitive_task, name, state FROM selector"):
             kept.selectors[task, name] = json.loads(state)
+        for _, task, _, *asked in sorted(questions(db), key=lambda row: (row[0] != kept.origin, -row[2], row[0])):
+            known = kept.asked.get(task, ())
+            question = question_of(asked)
+            kept.asked[task] = known if question in known else (*known, question)
         return kept
 
     def records_of(self, mission: str) -> int:
@@ -107,7 +130,7 @@ class EstimatesFile:
         if not self.path.exists():
             return 0
         with self._open() as db:
-            if _is_empty(db):
+            if is_empty(db):
                 return 0
             row = db.execute("SELECT records FROM mission WHERE id = ?", (mission,)).fetchone()
             return int(row[0]) if row else 0
@@ -121,54 +144,88 @@ class EstimatesFile:
         mission: str = "",
         records: int | None = None,
         late: Iterable[Correction] = (),
+        asked: Mapping[str, Question] | None = None,
     ) -> None:
         """Add what a session gained to this file's own origin, and keep its selectors' states (primitive task -> state).
 
         `mission`, `records`: remember that so many records of a mission run are counted, so that none counts twice when it is
         resumed (None: it has ended, nothing need be remembered). `late`: verdicts on runs that this file counted before; what
-        was reset meanwhile, or came along with a copied file, stays as it is.
+        was reset meanwhile, or came along with a copied file, stays as it is. `asked`: by what actions were judged (primitive
+        task -> question).
         """
         with self._writing() as db:
-            origin = _about(db, "origin")
-            if _counted_by(db, mission) == origin:
+            if fact(db, "origin") == fact(db, "closed"):
+                renew_origin(db)
+            origin = fact(db, "origin")
+            if fact(db, COUNTED + mission) == origin:
                 for correction in late:
-                    _correct_tally(db, origin, correction)
+                    correct_tally(db, origin, correction)
             for key, tally in gained.tallies.items():
-                _add_tally(db, origin, key, tally)
+                add_tally(db, origin, key, tally)
             for where, flow in gained.flows.items():
-                _add_flow(db, origin, where, flow)
+                add_flow(db, origin, where, flow)
             for task, state in selectors.items():
-                _put_selector(db, task, state)
-            db.execute("UPDATE about SET value = CAST(value AS INTEGER) + 1 WHERE name = 'generation'")
+                put_selector(db, task, state)
+            for task, question in (asked or {}).items():
+                row = db.execute("SELECT version FROM question WHERE origin = ? AND primitive_task = ?", (origin, task))
+                put_question(db, origin, task, question, (row.fetchone() or (0,))[0] + 1)
+            count_session(db)
             db.execute("DELETE FROM mission WHERE id = ?", (mission,))
             db.execute("DELETE FROM about WHERE name = ?", (COUNTED + mission,))
             if records is not None:
                 db.execute("INSERT INTO mission VALUES (?, ?)", (mission, records))
                 db.execute("INSERT INTO about VALUES (?, ?)", (COUNTED + mission, origin))
 
+    def put_closed(
+        self,
+        origin: str,
+        estimates: Estimates,
+        selectors: Mapping[str, Mapping[str, Any]],
+        asked: Mapping[str, Question],
+    ) -> None:
+        """Write the whole of what was counted under an origin of its own that nobody adds to (a campaign's).
+
+        A second time nothing changes; what others have added to the file, or what was reset, stays so.
+        """
+        with self._writing() as db:
+            db.execute("INSERT OR IGNORE INTO about VALUES ('closed', ?)", (origin,))
+            gone = {task for (task,) in db.execute("SELECT primitive_task FROM forgotten WHERE origin = ?", (origin,))}
+            tallies = [tally_row(origin, k, t) for k, t in estimates.tallies.items() if k.primitive_task not in gone]
+            flows = [] if "" in gone else [flow_row(origin, k, f) for k, f in estimates.flows.items()]
+            before = db.total_changes
+            take_later(db, "tally", tallies)
+            take_later(db, "flow", flows)
+            if db.total_changes > before:
+                count_session(db)
+            for task, state in selectors.items():
+                take_selector(db, task, state["selector"], state, origin)
+            for task, question in asked.items():
+                if task not in gone:
+                    put_question(db, origin, task, question, 1)
+
     def put_selectors(self, selectors: Mapping[str, Mapping[str, Any]]) -> None:
         """Replace selectors' states (freezing, overriding by hand)."""
         with self._writing() as db:
             for task, state in selectors.items():
-                _put_selector(db, task, state)
+                put_selector(db, task, state)
 
     def reset(self, primitive_task: str | None = None, *, selectors_only: bool = False) -> None:
         """Forget a primitive task (None: everything): selectors' states, and estimates unless `selectors_only`."""
         with self._writing() as db:
             which, given = ("WHERE primitive_task = ?", (primitive_task,)) if primitive_task else ("", ())
-            own = _about(db, "origin")
-            choices = [
-                (own, CHOICE + task) for (task,) in db.execute(f"SELECT primitive_task FROM selector {which}", given)
-            ]
+            tasks = db.execute(f"SELECT primitive_task FROM selector {which}", given).fetchall()
+            own = {fact(db, "origin"), fact(db, "closed")} - {""}
+            choices = [(origin, CHOICE + task) for origin in sorted(own) for (task,) in tasks]
             db.executemany("INSERT OR IGNORE INTO forgotten VALUES (?, ?)", choices)
             db.execute(f"DELETE FROM selector {which}", given)
-            _renew_origin(db)
+            renew_origin(db)
             if selectors_only:
                 return
             db.execute(
                 f"INSERT OR IGNORE INTO forgotten SELECT DISTINCT origin, primitive_task FROM tally {which}", given
             )
             db.execute(f"DELETE FROM tally {which}", given)
+            db.execute(f"DELETE FROM question {which}", given)
             if primitive_task is None:
                 db.execute("INSERT OR IGNORE INTO forgotten SELECT DISTINCT origin, '' FROM flow")
                 db.execute("DELETE FROM flow")
@@ -181,23 +238,26 @@ class EstimatesFile:
         if not other.exists():
             raise EstimatesError(f"{other}: no such file; give an estimates file that `run --learn` has made")
         with EstimatesFile(other)._open() as db:
-            if _is_empty(db):
+            if is_empty(db):
                 return
-            origin = _about(db, "origin")
+            origin = fact(db, "origin")
             rows = {name: db.execute(f"SELECT * FROM {name}").fetchall() for name in ("tally", "flow", "selector")}
+            rows["question"] = questions(db)
             gone = db.execute("SELECT * FROM forgotten").fetchall()
-            for *_, body in rows["tally"]:
-                _tally(body)
-            for *_, body in rows["flow"]:
-                _flow(body)
-            states = [(task, name, _state(body)) for task, name, _, body in rows["selector"]]
+            for row in rows["tally"]:
+                tally_of(row)
+            for row in rows["flow"]:
+                flow_of(row)
+            for _, _, _, *asked in rows["question"]:
+                question_of(asked)
+            states = [(task, name, state_of(body)) for task, name, _, body in rows["selector"]]
         with self._writing() as mine:
-            _take_later(mine, "tally", rows["tally"], "origin, primitive_task, action, context")
-            _take_later(mine, "flow", rows["flow"], "origin, task, transition_name, context")
+            for table in ("tally", "flow", "question"):
+                take_later(mine, table, rows[table])
             for task, name, state in states:
-                _take_selector(mine, task, name, state, origin)
+                take_selector(mine, task, name, state, origin)
             mine.executemany("INSERT OR IGNORE INTO forgotten VALUES (?, ?)", gone)
-            _forget(mine)
+            forget(mine)
 
     # --- the database ----------------------------------------------------------------------------------------------
 
@@ -210,8 +270,10 @@ class EstimatesFile:
             raise EstimatesError(f"{self.path}: {fault.strerror}; give a folder that can be made") from fault
         with self._open() as db:
             db.execute("BEGIN IMMEDIATE")
-            if _is_empty(db):
+            if is_empty(db):
                 self._make(db)
+            elif schema(db) < SCHEMA:
+                migrate(db)
             self._settle(db)
             yield db
             db.execute("COMMIT")
@@ -230,7 +292,7 @@ class EstimatesFile:
         here = _home(self.path)
         known = db.execute("SELECT value FROM about WHERE name = 'home'").fetchone()
         if known is not None and known[0] != here:
-            _renew_origin(db)
+            renew_origin(db)
         db.execute("INSERT OR REPLACE INTO about VALUES ('home', ?)", (here,))
 
     @contextmanager
@@ -252,13 +314,13 @@ class EstimatesFile:
             ) from fault
 
     def _check(self, db: sqlite3.Connection) -> None:
-        empty = _is_empty(db)
-        (application,), (version,) = (db.execute(f"PRAGMA {p}").fetchone() for p in ("application_id", "user_version"))
+        empty = is_empty(db)
+        application, version = db.execute("PRAGMA application_id").fetchone()[0], schema(db)
         if empty and not application and not version:
             return
         if application != APPLICATION:
             raise EstimatesError(f"{self.path}: a database, but no estimates file; give --learn another file")
-        if version != SCHEMA:
+        if not 1 <= version <= SCHEMA:
             raise EstimatesError(
                 f"{self.path}: written with schema {version}, this petrobot reads {SCHEMA}; "
                 f"{'upgrade petrobot' if version > SCHEMA else 'start a new file'} or give another one"
@@ -269,108 +331,3 @@ def _home(path: Path) -> str:
     """Which file on which machine this is: another one after copying, the same after renaming."""
     machine = MACHINE_ID.read_text(encoding="ascii", errors="replace").strip() if MACHINE_ID.is_file() else ""
     return f"{machine}:{path.stat().st_ino}"
-
-
-def _is_empty(db: sqlite3.Connection) -> bool:
-    return int(db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]) == 0
-
-
-def _renew_origin(db: sqlite3.Connection) -> None:
-    db.execute("UPDATE about SET value = ? WHERE name = 'origin'", (secrets.token_hex(8),))
-
-
-def _about(db: sqlite3.Connection, name: str) -> str:
-    return str(db.execute("SELECT value FROM about WHERE name = ?", (name,)).fetchone()[0])
-
-
-def _add_tally(db: sqlite3.Connection, origin: str, key: Key, gained: Tally) -> None:
-    _put_tally(db, origin, key, merge_tallies(_own_tally(db, origin, key), gained))
-
-
-def _correct_tally(db: sqlite3.Connection, origin: str, correction: Correction) -> None:
-    key = Key(correction.primitive_task, correction.action, correction.context)
-    with suppress(KeyError):  # the run is not among this origin's any more
-        _put_tally(db, origin, key, corrected(_own_tally(db, origin, key), correction))
-
-
-def _counted_by(db: sqlite3.Connection, mission: str) -> str:
-    """The origin under which the runs of an interrupted mission run were counted; empty if none was."""
-    row = db.execute("SELECT value FROM about WHERE name = ?", (COUNTED + mission,)).fetchone()
-    return str(row[0]) if row else ""
-
-
-def _own_tally(db: sqlite3.Connection, origin: str, key: Key) -> Tally:
-    where = (origin, key.primitive_task, key.action, key.context)
-    row = db.execute(
-        "SELECT body FROM tally WHERE origin = ? AND primitive_task = ? AND action = ? AND context = ?", where
-    ).fetchone()
-    return _tally(row[0]) if row else Tally()
-
-
-def _put_tally(db: sqlite3.Connection, origin: str, key: Key, tally: Tally) -> None:
-    where = (origin, key.primitive_task, key.action, key.context)
-    body = json.dumps(tally.to_plain(), separators=(",", ":"))
-    db.execute("INSERT OR REPLACE INTO tally VALUES (?, ?, ?, ?, ?, ?)", (*where, tally.changes, body))
-
-
-def _add_flow(db: sqlite3.Connection, origin: str, key: PassageKey, gained: Flow) -> None:
-    where = (origin, key.task, key.transition, key.context)
-    row = db.execute(
-        "SELECT body FROM flow WHERE origin = ? AND task = ? AND transition_name = ? AND context = ?", where
-    ).fetchone()
-    flow = merge_flows(_flow(row[0]) if row else Flow(), gained)
-    body = json.dumps([flow.fired, flow.waits.to_plain()])
-    db.execute("INSERT OR REPLACE INTO flow VALUES (?, ?, ?, ?, ?, ?)", (*where, flow.fired, body))
-
-
-def _put_selector(db: sqlite3.Connection, task: str, state: Mapping[str, Any]) -> None:
-    body = json.dumps(state, separators=(",", ":"))
-    db.execute("INSERT OR REPLACE INTO selector VALUES (?, ?, ?, ?)", (task, state["selector"], trials(state), body))
-
-
-def _take_selector(db: sqlite3.Connection, task: str, name: str, state: Mapping[str, Any], origin: str) -> None:
-    """Another file's state, unless what was learned there under that origin was reset here."""
-    if db.execute(
-        "SELECT 1 FROM forgotten WHERE origin = ? AND primitive_task = ?", (origin, CHOICE + task)
-    ).fetchone():
-        return
-    row = db.execute("SELECT state FROM selector WHERE primitive_task = ? AND name = ?", (task, name)).fetchone()
-    _put_selector(db, task, state if row is None else joined(_state(row[0]), state))
-
-
-def _forget(db: sqlite3.Connection) -> None:
-    """Drop what some file has reset; if that was this file's own, what it learns from now on is another origin's."""
-    db.execute(
-        "DELETE FROM tally WHERE EXISTS (SELECT 1 FROM forgotten f WHERE f.origin = tally.origin "
-        "AND f.primitive_task = tally.primitive_task)"
-    )
-    db.execute(
-        "DELETE FROM flow WHERE EXISTS (SELECT 1 FROM forgotten f WHERE f.origin = flow.origin "
-        "AND f.primitive_task = '')"
-    )
-    if db.execute("SELECT 1 FROM forgotten WHERE origin = ?", (_about(db, "origin"),)).fetchone():
-        _renew_origin(db)
-
-
-def _take_later(db: sqlite3.Connection, table: str, rows: list[tuple[Any, ...]], key: str) -> None:
-    marks = ", ".join("?" for _ in range(key.count(",") + 3))
-    db.executemany(
-        f"INSERT INTO {table} VALUES ({marks}) ON CONFLICT({key}) DO UPDATE SET version = excluded.version, "
-        "body = excluded.body WHERE excluded.version > version",
-        rows,
-    )
-
-
-def _tally(body: str) -> Tally:
-    return Tally.of_plain(json.loads(body))
-
-
-def _state(body: str) -> dict[str, Any]:
-    state: dict[str, Any] = json.loads(body)
-    trials(state)
-    return state
-
-
-def _flow(body: str) -> Flow:
-    fired, waits = json.loads(body)
-    return Flow(int(fired), Moments.of_plain(waits))

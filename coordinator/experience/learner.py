@@ -7,6 +7,7 @@ keep them; so a resumed run, whose recorded steps are shown to it again, has the
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -25,6 +26,9 @@ from coordinator.learning.records import Choice, Correction, End, Passage, Recor
 from coordinator.mission.partners import FirstAlternative
 from coordinator.task import Task
 from services.comm.notice import Progress
+
+LARGEST = 1e150
+"""Numbers of results from here on are no costs: their squares could not be summed."""
 
 
 class ContextError(ValueError):
@@ -122,7 +126,9 @@ class LearningSelector(FirstAlternative):
         self._declared = declared
         self._values: Mapping[str, Any] = {}
         self._going: dict[str, _Going] = {}
-        self._deferred: dict[str, End] = {}
+        self._deferred: dict[str, tuple[End, int]] = {}
+        """Runs whose verdict may still come, each with the trials of its primitive task and context up to then."""
+        self._trials: Counter[tuple[str, str]] = Counter()
         self._waiting: dict[str, float] = {}
         self._watched = _waits_for_events(learning.task)
 
@@ -227,7 +233,7 @@ class LearningSelector(FirstAlternative):
         context = self.context if going.context is None else going.context
         preempted = (going.taken_by or "") if record.cancelled else None
         until = going.taken_at if preempted else now
-        seconds = record.seconds if preempted is None else round(max(0.0, until - going.entered), 6)
+        seconds = max(0.0, record.seconds) if preempted is None else round(max(0.0, until - going.entered), 6)
         result = going.ended
         outcome = Observation(
             record.status,
@@ -240,8 +246,11 @@ class LearningSelector(FirstAlternative):
             round(max(0.0, now - going.entered - seconds), 6) if preempted is None else None,
         )
         end = End(record.primitive_task, record.action, context, outcome)
+        selector, where = self.learning.selectors.get(end.primitive_task), (end.primitive_task, context)
+        if selector is not None and selector.learns_from(end.action, outcome):
+            self._trials[where] += 1
         if record.deferred:
-            self._deferred[record.run] = end
+            self._deferred[record.run] = (end, self._trials[where])
         self._note(end)
 
     def _cpu(self, record: RunRecorded, result: RunEnded | None) -> float | None:
@@ -251,18 +260,19 @@ class LearningSelector(FirstAlternative):
         return None if result is None else result.cpu_seconds
 
     def _corrected(self, corrected: Corrected) -> None:
-        end = self._deferred.pop(corrected.run, None)
+        end, trials = self._deferred.pop(corrected.run, (None, 0))
         if end is not None:
             what = (end.primitive_task, end.action, end.context, end.outcome)
-            self._note(Correction(*what, corrected.status, corrected.cause))
+            age = self._trials[end.primitive_task, end.context] - trials
+            self._note(Correction(*what, corrected.status, corrected.cause, age))
 
 
 def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
-    """The numbers of a result; anything else is no cost."""
+    """The numbers of a result; anything else is no cost. What is not finite would spoil every sum that it came into."""
     return {
         name: float(value)
         for name, value in sorted(values.items())
-        if isinstance(value, int | float) and not isinstance(value, bool)
+        if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < LARGEST
     }
 
 

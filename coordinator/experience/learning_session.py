@@ -99,7 +99,7 @@ class LearningSession:
         done = self.file.records_of(self._token)
         gained, late = (self.learning.gained, ()) if not done else self._gained_after(done)
         counted = len(self.selector.records) if interrupted else None
-        self.file.add(gained, self.learning.state(), self._token, counted, late)
+        self.file.add(gained, self.learning.state(), self._token, counted, late, self.learning.asked())
         return sum(t.runs + t.censored for t in gained.tallies.values())
 
     def _gained_after(self, done: int) -> tuple[Estimates, Sequence[Correction]]:

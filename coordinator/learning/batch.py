@@ -162,9 +162,14 @@ class Batch:
             if values.shape != (self.n,) or not np.all(np.isfinite(values)) or np.any(values < 0):
                 raise ValueError(f"{name} needs {self.n} numbers that are not negative")
             getattr(self, name)[0] = values
+        self.successes[0] = np.minimum(
+            self.successes[0], self.runs[0]
+        )  # states written before corrections were bounded
         if abs(self.p[0].sum() - 1) > 1e-6:
             raise ValueError("probabilities that do not sum to 1")
         self.k[0] = float(data["k"])
+        if not 0 <= self.k[0] < np.inf:
+            raise ValueError(f"{data['k']!r} trials")
         for name, array in self.own.items():
             values = np.asarray(data["own"][name], dtype=float)
             if values.shape != array.shape[1:]:

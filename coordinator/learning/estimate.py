@@ -13,11 +13,13 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from coordinator.learning.intervals import clopper_pearson, wilson
-from coordinator.learning.moments import EMPTY, Moments, merged
+from coordinator.learning.moments import EMPTY, Moments, merged, whole
 from coordinator.learning.sample import Sample, quantile
 from coordinator.task import Executed, Status
 
 CENSORED = "none"
+COUNT = "count"
+"""The measure, and the value of a result in which a run reports it."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -128,13 +130,19 @@ class Tally:
         return out
 
     def cost(self, measure: str = "wall") -> Moments:
-        """The cost by a measure: `wall`, `cpu`, `count` (each run costs 1) or `value:NAME`, over the counted runs."""
+        """The cost by a measure, over the counted runs: `wall`, `cpu` (s), `count` or `value:NAME`.
+
+        `count` is how many things a run used, as it reports in its value `count` (images averaged, tries); one that reports
+        none counts as 1.
+        """
         if measure == "wall":
             return self.wall
         if measure == "cpu":
             return self.cpu
-        if measure == "count":
-            return Moments(self.runs, 1.0, 0.0, 1.0, 1.0) if self.runs else EMPTY
+        if measure == COUNT:
+            said = self.values.get(COUNT, EMPTY)
+            silent = self.runs - said.n
+            return said.merged(Moments(silent, 1.0, 0.0, 1.0, 1.0)) if silent else said
         kind, _, name = measure.partition(":")
         if kind != "value" or not name:
             raise ValueError(f"{measure!r} is no cost measure: write wall, cpu, count or value:NAME")
@@ -214,19 +222,47 @@ class Tally:
 
     @classmethod
     def of_plain(cls, data: Mapping[str, Any]) -> Tally:
-        """What `to_plain` gave. Raises ValueError, KeyError or TypeError for anything else."""
-        return cls(
-            {(str(Status(status)), str(cause)): int(n) for status, cause, n in data["counts"]},
+        """What `to_plain` gave. Raises ValueError, KeyError or TypeError for anything else.
+
+        Numbers that no sequence of runs could have left (negative ones, more times than runs, ...) are refused: merged, they
+        would spoil every figure.
+        """
+        counts = {(str(Status(status)), str(cause)): whole(n, "runs") for status, cause, n in data["counts"]}
+        read = cls(
+            counts,
             {str(exit_): Moments.of_plain(m) for exit_, m in data["durations"].items()},
             Moments.of_plain(data["cpu"]),
             {str(name): Moments.of_plain(m) for name, m in data["values"].items()},
             Moments.of_plain(data["waited"]),
-            {str(cause): int(n) for cause, n in data["not_executed"].items()},
-            int(data["unknown"]),
-            int(data["corrected"]),
-            int(data["changes"]),
+            {str(cause): whole(n, "runs that never began") for cause, n in data["not_executed"].items()},
+            whole(data["unknown"], "runs of which it is not known whether they were executed", sum(counts.values())),
+            whole(data["corrected"], "corrections"),
+            whole(data["changes"], "changes"),
             Sample.of_plain(data["sample"]),
         )
+        read._check()
+        return read
+
+    def _check(self) -> None:
+        """Raise ValueError where the parts do not belong together."""
+        for status in Status:
+            timed = sum(m.n for exit_, m in self.durations.items() if exit_.partition(":")[0] == status)
+            if timed != self.count(status):
+                raise ValueError(
+                    f"{self.count(status)} runs ended with {status}, but {timed} such runs have a duration"
+                )
+        executed = self.runs + self.censored
+        if sum(m.n for m in self.durations.values()) != executed:
+            raise ValueError(f"runs that ended as none of {', '.join(Status)}, nor censored")
+        for name, moments in (("cpu", self.cpu), *self.values.items()):
+            whole(moments.n, f"numbers called {name}", self.runs)
+        whole(self.waited.n, "waits", executed)
+        whole(len(self.sample.kept), "runs in the sample", executed)
+        least = executed + sum(self.not_executed.values())
+        if self.changes < least:
+            raise ValueError(f"{self.changes} changes made it, but {least} runs stand in it")
+        if any(m.low < 0 for m in (*self.durations.values(), self.cpu, self.waited) if m.n):
+            raise ValueError("seconds below 0")
 
 
 def merge(one: Tally, other: Tally) -> Tally:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -121,7 +122,7 @@ class Learning:
         elif isinstance(record, End):
             selector.update(record.context, record.action, record.outcome)
         elif record.was.status is not None:
-            selector.correct(record.context, record.action, record.was.status, record.status)
+            selector.correct(record.context, record.action, record.was.status, record.status, record.age)
 
     # --- reading ---------------------------------------------------------------------------------------------------
 
@@ -136,10 +137,28 @@ class Learning:
         Over scenarios the target reliability is the one that was given, else the one that the task file declares.
         """
         tallies, primitive = self.estimates.of(primitive_task, context), self.task.primitive_tasks[primitive_task]
-        question = self.question(primitive_task)
-        if context is None and question.target is None:
-            question = replace(question, target=primitive.target_reliability)
+        question = self.question(primitive_task) if context is not None else self.asked()[primitive_task]
         return compare({a: tallies.get(a, {}) for a in primitive.alternatives}, question)
+
+    def asked(self) -> dict[str, Question]:
+        """By what the actions of each primitive task are judged over scenarios: the target given, else the declared one."""
+        found = {}
+        for name, primitive in self.task.primitive_tasks.items():
+            question = self.question(name)
+            declared = primitive.target_reliability if question.target is None else question.target
+            found[name] = replace(question, target=declared)
+        return found
+
+    def uncosted(self) -> list[tuple[str, str, str]]:
+        """(primitive task, action, measure) of what was run in this session without ever having a cost by that measure."""
+        found = []
+        for name in self.task.primitive_tasks:
+            measure = self.question(name).measure
+            for action, by_context in self.gained.of(name).items():
+                whole = reduce(merge, by_context.values(), NOTHING)
+                if whole.runs and not whole.cost(measure).n:
+                    found.append((name, action, measure))
+        return found
 
     # --- state -----------------------------------------------------------------------------------------------------
 

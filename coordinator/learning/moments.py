@@ -73,16 +73,24 @@ class Moments:
 
     @classmethod
     def of_plain(cls, data: list[float]) -> Moments:
-        """What `to_plain` gave. Raises ValueError."""
+        """What `to_plain` gave. Raises ValueError or TypeError."""
         if not data:
             return cls()
-        n, mean, m2, low, high = data
-        if n < 1 or m2 < 0:
-            raise ValueError(f"{data} are no moments: n >= 1 and m2 >= 0 are needed")
-        return cls(int(n), float(mean), float(m2), float(low), float(high))
+        n, (mean, m2, low, high) = whole(data[0], "numbers"), (float(x) for x in data[1:])
+        slack = 1e-6 * max(abs(low), abs(high))  # means are rounded
+        if n < 1 or not m2 >= 0 or not low - slack <= mean <= high + slack:
+            raise ValueError(f"{data} are no moments: n >= 1, m2 >= 0 and low <= mean <= high are needed")
+        return cls(n, mean, m2, low, high)
 
 
 EMPTY = Moments()
+
+
+def whole(n: Any, what: str, most: float = inf) -> int:
+    """A count from plain data. Raises ValueError unless it is a whole number from 0 to `most`."""
+    if isinstance(n, bool) or not isinstance(n, int) or not 0 <= n <= most:
+        raise ValueError(f"{n!r} {what}: a whole number from 0{'' if most == inf else f' to {most:g}'} is needed")
+    return n
 
 
 def merged(one: Mapping[Any, Moments], other: Mapping[Any, Moments]) -> dict[Any, Moments]:

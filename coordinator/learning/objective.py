@@ -1,9 +1,11 @@
 """The cost function J = 1 - A R + rho C of primitive actions, and the questions that can be asked of it (paper, section 3).
 
-C of an action over several scenarios is its mean cost in the hardest scenario whose reliability is not below the target R_d;
-which scenarios those are is decided by the lower confidence bound, with hysteresis. rho = 1 / max C over the actions of the one
-primitive task, or declared. All J of a comparison are computed from sums with one rho; J made under different rho are never
-averaged.
+Over several scenarios an action is judged by its worst case. R is its reliability in the scenario that is hardest for it, never
+the share over all its runs: actions that were run in unequal shares of easy and hard scenarios would be put in the wrong order
+(E. H. Simpson, J. Royal Statistical Society B 13 (1951) 238). C is its mean cost in the hardest scenario whose reliability is
+not below the target R_d; which those are is decided by the lower confidence bound, with hysteresis. rho = 1 / max C over the
+actions of the one primitive task, or declared. All J of a comparison are computed from sums with one rho; J made under
+different rho are never averaged.
 """
 
 from __future__ import annotations
@@ -32,14 +34,18 @@ class Figures:
 
     action: str
     runs: int
+    """In all scenarios."""
     reliability: float
-    """R over all runs of the comparison; nan without any."""
+    """R in the scenario that is hardest for it; nan without any run."""
     lower: float
     upper: float
-    """Confidence bounds of R."""
+    """Confidence bounds of R there."""
+    worst: str | None
+    """That scenario; None without any run."""
     availability: float
+    """Over all scenarios: whether a node is there does not depend on the scenario."""
     cost: float
-    """C; nan where nothing is known, inf where no scenario meets the target."""
+    """C; nan where nothing is known, inf where no scenario meets the target that others meet."""
     scenario: str | None
     """The hardest scenario that still meets the target (s*); None: none meets it."""
     scenarios: tuple[str, ...]
@@ -66,10 +72,20 @@ class Comparison:
 
     rho: float
     figures: tuple[Figures, ...]
+    scenarios: tuple[str, ...]
+    """Scenarios in which every action that was run was run, over which all are judged; empty: there is none, so each was
+    judged over its own, and the order means little."""
+    unmet: bool
+    """No action meets the target in any scenario, so J was made without it."""
+
+    @property
+    def uncosted(self) -> tuple[str, ...]:
+        """Actions that were run, but of which no run has a cost: J takes it as 0."""
+        return tuple(f.action for f in self.figures if f.runs and isnan(f.cost))
 
     @property
     def best(self) -> str | None:
-        """The admissible action with the lowest J; None while nothing is known of any."""
+        """The action with the lowest J, of the admissible ones if there is any; None while nothing is known of any."""
         known = [f for f in self.figures if not isnan(f.j) and f.j < inf]
         return min(known, key=lambda f: f.j).action if known else None
 
@@ -126,25 +142,58 @@ def compare(
 ) -> Comparison:
     """Judge the alternatives of a primitive task. `actions` are each action's tallies by scenario.
 
-    `before` is the set of admitted scenarios by action of the last comparison (hysteresis). R is taken over all runs, C in
-    the hardest admitted scenario.
+    `before` is the set of admitted scenarios by action of the last comparison (hysteresis). All actions are judged over the
+    scenarios in which all of them were run, R in the worst of these, C in the hardest admitted one. While no action meets the
+    target in any scenario, none is ruled out.
     """
-    was = before or {}
-    rows = [_row(name, tallies, question, was.get(name, ())) for name, tallies in actions.items()]
+    was, common = before or {}, shared(actions)
+    over = {a: {s: t for s, t in by.items() if not common or s in common} for a, by in actions.items()}
+    inside = {a: admitted(by, question.target, was.get(a, ()), question.level) for a, by in over.items()}
+    unmet = not any(inside.values())
+    rows = []
+    for action, by_scenario in over.items():
+        whole = reduce(merge, actions[action].values(), Tally())
+        rows.append(_row(action, whole, by_scenario, inside[action], question, unmet))
     rho = cost_weight(f.cost for f in rows) if question.rho is None else question.rho
-    return Comparison(rho, tuple(_judged(f, rho) for f in rows))
+    known = any(f.runs for f in rows)
+    return Comparison(rho, tuple(_judged(f, rho) for f in rows), common, unmet and known)
 
 
-def _row(name: str, tallies: Mapping[str, Tally], question: Question, before: Sequence[str]) -> Figures:
-    whole = reduce(merge, tallies.values(), Tally())
-    inside = admitted(tallies, question.target, before, question.level)
-    worst = hardest(tallies, inside)
-    costs = {s: _mean_cost(tallies[s], question.measure) for s in inside}
-    cost = costs[worst] if worst is not None else (inf if whole.runs else nan)
+def shared(actions: Mapping[str, Mapping[str, Tally]]) -> tuple[str, ...]:
+    """The scenarios in which every action was run that was run at all, in order of their names."""
+    run = [{s for s, t in by.items() if t.runs} for by in actions.values()]
+    return tuple(sorted(set.intersection(*known))) if (known := [s for s in run if s]) else ()
+
+
+def _row(
+    action: str,
+    whole: Tally,
+    by_scenario: Mapping[str, Tally],
+    inside: tuple[str, ...],
+    question: Question,
+    unmet: bool,
+) -> Figures:
+    """J is left open."""
+    known = {s: t for s, t in by_scenario.items() if t.runs}
+    worst = hardest(known, tuple(known))
+    there = known[worst] if worst is not None else Tally()
+    among = tuple(known) if unmet else inside
+    scenario = hardest(known, among)
+    costs = {s: _mean_cost(known[s], question.measure) for s in among}
+    cost = costs[scenario] if scenario is not None else (inf if known else nan)
     largest = max((c for c in costs.values() if not isnan(c)), default=cost)
-    low, high = whole.interval(question.level)
     return Figures(
-        name, whole.runs, whole.reliability, low, high, whole.availability, cost, worst, inside, largest, nan
+        action,
+        whole.runs,
+        there.reliability,
+        *there.interval(question.level),
+        worst,
+        whole.availability,
+        cost,
+        scenario if inside else None,
+        inside,
+        largest,
+        nan,
     )
 
 

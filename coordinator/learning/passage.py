@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from coordinator.learning.moments import EMPTY, Moments
+from coordinator.learning.moments import EMPTY, Moments, whole
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -23,6 +25,17 @@ class Flow:
     fired: int = 0
     waits: Moments = EMPTY
     """Seconds from the marking that enabled it to each firing."""
+
+    def to_plain(self) -> list[Any]:
+        """Plain data."""
+        return [self.fired, self.waits.to_plain()]
+
+    @classmethod
+    def of_plain(cls, data: Sequence[Any]) -> Flow:
+        """What `to_plain` gave. Raises ValueError or TypeError."""
+        fired, waits = whole(data[0], "firings"), Moments.of_plain(data[1])
+        whole(waits.n, "waits", fired)
+        return cls(fired, waits)
 
     def adding(self, waited: float | None = None) -> Flow:
         """With one more firing."""

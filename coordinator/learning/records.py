@@ -39,6 +39,8 @@ class Correction:
     was: Observation
     status: Status
     cause: str = ""
+    age: int = 0
+    """Trials of the primitive task in this context since that run ended: of what fades, so much less is corrected."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +64,7 @@ def to_plain(record: Record) -> dict[str, Any]:
     if isinstance(record, End):
         return {"kind": "End", **about, "outcome": _observation(record.outcome)}
     if isinstance(record, Correction):
-        verdict = {"status": record.status.value, "cause": record.cause}
+        verdict = {"status": record.status.value, "cause": record.cause, "age": record.age}
         return {"kind": "Correction", **about, "was": _observation(record.was), **verdict}
     return {"kind": "Choice", **about}
 
@@ -78,7 +80,8 @@ def of_plain(data: Mapping[str, Any]) -> Record:
     if kind == "End":
         return End(*about, _observed(data["outcome"]))
     if kind == "Correction":
-        return Correction(*about, _observed(data["was"]), Status(data["status"]), str(data["cause"]))
+        verdict = (Status(data["status"]), str(data["cause"]), int(data.get("age", 0)))
+        return Correction(*about, _observed(data["was"]), *verdict)
     raise ValueError(f"{kind!r} is no record of learning")
 
 

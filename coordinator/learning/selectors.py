@@ -14,7 +14,7 @@ import numpy as np
 from coordinator.learning.automata import DiscretisedPursuit, NikolicFu, RewardInaction
 from coordinator.learning.bandits import UCB1, Thompson
 from coordinator.learning.batch import SUMS, Batch, Mask, Trial
-from coordinator.learning.estimate import Observation, Tally
+from coordinator.learning.estimate import COUNT, Observation, Tally
 from coordinator.learning.objective import Question
 from coordinator.learning.rule import Rule
 from coordinator.learning.target import eligible
@@ -148,12 +148,9 @@ class RuleSelector:
 
     def update(self, context: str, action: str, outcome: Observation) -> None:
         """Learn from a run; a censored one teaches nothing."""
-        missing = outcome.executed is Executed.NO and outcome.preempted_by is None
-        if self.frozen or action not in self.actions or (outcome.status is None and not missing):
+        if self.frozen or not self.learns_from(action, outcome):
             return
-        if outcome.executed is Executed.NO and not missing:
-            return
-        batch = self._kept(context)
+        batch, missing = self._kept(context), _is_missing(outcome)
         trial = Trial(
             np.array([self.actions.index(action)]),
             np.array([float(outcome.status is Status.SUCCESS)]),
@@ -161,6 +158,12 @@ class RuleSelector:
             np.array([not missing]),
         )
         self.rule.learn(batch, trial, self._eligible(batch))
+
+    def learns_from(self, action: str, outcome: Observation) -> bool:
+        """Whether a run is a trial: of one of the actions, and neither censored nor cancelled before it began."""
+        if action not in self.actions:
+            return False
+        return _is_missing(outcome) or (outcome.status is not None and outcome.executed is not Executed.NO)
 
     def _eligible(self, batch: Batch) -> Mask | None:
         """Actions that meet the target, judged on what was known before this trial."""
@@ -171,13 +174,19 @@ class RuleSelector:
         batch.own["admitted"][:] = now
         return now
 
-    def correct(self, context: str, action: str, was: Status, status: Status) -> None:
-        """A deferred verdict: the sums change once; what was chosen meanwhile stays chosen."""
+    def correct(self, context: str, action: str, was: Status, status: Status, age: int = 0) -> None:
+        """A deferred verdict on the run `age` trials ago: the sums change once; what was chosen meanwhile stays chosen.
+
+        As much is corrected as the sums still hold of that run (a rule may fade or drop them), and a success more or less
+        never leaves 0 to all runs.
+        """
         if self.frozen or action not in self.actions:
             return
         change = float(status is Status.SUCCESS) - float(was is Status.SUCCESS)
         batch, i = self._kept(context), self.actions.index(action)
-        batch.successes[0, i] = max(0.0, batch.successes[0, i] + change)
+        if isinstance(self.rule, Tracking):
+            change = self.rule.correcting(batch, i, change, age)
+        batch.successes[0, i] = min(max(0.0, batch.successes[0, i] + change), batch.runs[0, i])
 
     def prime(self, context: str, tallies: Mapping[str, Tally]) -> None:
         """Take the sums over from estimates (other machines' runs came in); rules that fade their sums keep their own."""
@@ -237,12 +246,17 @@ class RuleSelector:
         # the gain starts again, so that a newcomer can still win; the sums of the others are not lost
 
 
+def _is_missing(outcome: Observation) -> bool:
+    """Whether a run never began although nobody cancelled it."""
+    return outcome.executed is Executed.NO and outcome.preempted_by is None
+
+
 def cost_of(outcome: Observation, measure: str) -> float:
     """A run's cost by a measure; nan where it was not measured."""
     if measure == "wall":
         return outcome.seconds
-    if measure == "count":
-        return 1.0
+    if measure == COUNT:
+        return float(outcome.values.get(COUNT, 1.0))
     if measure == "cpu":
         return float("nan") if outcome.cpu_seconds is None else outcome.cpu_seconds
     return float(outcome.values.get(measure.removeprefix("value:"), float("nan")))

@@ -63,6 +63,19 @@ class Tracking:
         gain = np.maximum(self.gain_floor, np.minimum(1.0, 1.0 / batch.k**self.exponent))
         batch.p += gain[:, None] * (one_hot(batch.best(eligible), batch.n) - batch.p)
 
+    def correcting(self, batch: Batch, action: int, change: float, age: int) -> float:
+        """What is left in the sums of the trial `age` trials ago of the change of its success; one row.
+
+        Nothing of a trial before the last restart. The test's own mean since the restart does not fade.
+        """
+        since = batch.k[0] - (batch.own["restarts"][0, 0] > 0)  # a restart leaves k at 1
+        if age >= since:
+            return 0.0
+        seen, met = (batch.own[name][0] for name in ("seen", "seen_success"))
+        met[action] = min(max(0.0, met[action] + change), seen[action])
+        left: float = change * (1.0 - 1.0 / self.memory) ** age
+        return left
+
     def _alarm(self, batch: Batch, trial: Trial) -> Mask:
         """Whether the chosen action's success or cost has left its mean since the restart."""
         at = (np.arange(len(batch.k)), trial.action)

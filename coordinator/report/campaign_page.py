@@ -9,7 +9,7 @@ from typing import Any
 from coordinator.campaign.observed import regime_of
 from coordinator.campaign.plan import Plan
 from coordinator.campaign.rows import Row
-from coordinator.campaign.summary import Summary, comparisons
+from coordinator.campaign.summary import Summary
 from coordinator.campaign.throws import Throw
 from coordinator.learning.objective import Figures, break_even, pareto
 from coordinator.record.timeline import Bar, Timeline
@@ -44,7 +44,7 @@ class CampaignReport:
 
     def __init__(self, plan: Plan, task: Task, rows: Sequence[Row], plots: Mapping[str, Any]) -> None:
         self.plan, self.task, self.rows = plan, task, rows
-        self.summary = Summary.of(task, rows)
+        self.summary = Summary.of(task, rows, options=plan.options)
         self.trials = objective_curves(task, rows)
         learned_curves(plan, rows, self.trials)
         word = "choice probability" if plan.batch else "share of choices"
@@ -135,7 +135,7 @@ class CampaignReport:
 
     def _judged(self) -> list[str]:
         out = []
-        for primitive, judged in comparisons(self.task, self.summary.estimates.tallies).items():
+        for primitive, judged in self.summary.comparisons().items():
             front = {f.action for f in pareto(judged.figures)}
             best = next((f for f in judged.figures if f.action == judged.best), None)
             rows = [_action_row(f, front, best) for f in judged.figures]
@@ -193,11 +193,12 @@ def _action_row(f: Figures, front: set[str], best: Figures | None) -> dict[str, 
     return {
         "action": f.action + (" (lowest J)" if best is not None and f.action == best.action else ""),
         "runs": f.runs,
-        "R": f.reliability,
+        "R in its hardest regime": f.reliability,
         "95 %": f"{f.lower:.3f} to {f.upper:.3f}",
         "availability": f.availability,
         "C": f.cost,
-        "hardest regime": regime_of(f.scenario or ""),
+        "hardest regime": regime_of(f.worst or ""),
+        "hardest that meets the target": None if f.scenario is None else regime_of(f.scenario),
         "J": f.j,
         "not beaten in both R and C": f.action in front,
         "same J as the best at rho": even,

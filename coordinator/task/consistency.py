@@ -38,7 +38,7 @@ from coordinator.task.subnets import CircleError
 
 _IDENTIFIER = re.compile(r"[^\W\d]\w*\Z")
 _RESERVED = frozenset({"and", "or", "not", "true", "false", "none"})
-_COST = re.compile(r"(wall|cpu|value:[^\W\d]\w*)\Z")
+_COST = re.compile(r"(wall|cpu|count|value:[^\W\d]\w*)\Z")
 
 
 def faults(task: Task) -> tuple[Fault, ...]:
@@ -116,7 +116,7 @@ def _primitive_task(p: PrimitiveTask) -> Iterator[Fault]:
     if not 0 < p.target_reliability <= 1:
         yield Fault(f"{key}.target_reliability", f"{p.target_reliability} is no probability", "give 0 < R <= 1")
     if not _COST.match(p.cost):
-        yield Fault(f"{key}.cost", f"{p.cost!r} is no cost measure", "write wall, cpu or value:NAME")
+        yield Fault(f"{key}.cost", f"{p.cost!r} is no cost measure", "write wall, cpu, count or value:NAME")
     yield from _estimates(p, f"{key}.estimates")
 
 

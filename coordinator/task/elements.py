@@ -126,7 +126,7 @@ class PrimitiveTask:
     target_reliability: float = 0.9
     """R_d of docs: cost is taken in the hardest scenario whose reliability is not below it."""
     cost: str = "wall"
-    """`wall` or `cpu` (s), or `value:NAME`: a number of that name in the action's result."""
+    """`wall` or `cpu` (s), `count` (what the result says in `count`, else 1), or `value:NAME`: a number of that name in it."""
     error_causes: Mapping[str, str] = field(default_factory=dict)
     """Cause codes that its actions give with ERROR, with a sentence for people."""
     start: Start = Start.WHEN_FREE

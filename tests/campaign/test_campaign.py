@@ -9,17 +9,25 @@ import json
 import os
 import signal
 from collections.abc import Iterator
+from dataclasses import replace
+from math import isfinite
 from pathlib import Path
 
 import pytest
 
 from coordinator.campaign.conduct import Campaign, Progress
-from coordinator.campaign.plan import CampaignError, Plan
+from coordinator.campaign.observed import regime_of
+from coordinator.campaign.plan import MANIFEST, CampaignError, Plan, digest, read_manifest, write_manifest
 from coordinator.campaign.pool import LocalPool
+from coordinator.campaign.summary import Summary, comparisons, result_of
 from coordinator.campaign.table import TABLE, read_table
 from coordinator.campaign.worker import serve
+from coordinator.cli import main
+from coordinator.cli.campaign import text_of
+from coordinator.experience.estimates_file import EstimatesFile
 from coordinator.launch import Setting, lockstep_cell
-from tests.campaign.conftest import Conduct
+from coordinator.learning.objective import Question, compare
+from tests.campaign.conftest import SERVICES, TASK, Conduct
 from tests.waiting import beat
 
 
@@ -30,8 +38,6 @@ def table(folder: Path) -> bytes:
 
 def test_blocks_cover_all_throws_whatever_their_size(toy_plan: Plan) -> None:
     """Regimes take turns and share their seeds; numbers and seeds come from the index alone."""
-    from dataclasses import replace
-
     for runs, block in ((1, 4), (7, 3), (12, 5), (20, 1)):
         blocks = replace(toy_plan, runs=runs, block=block).blocks
         assert [b.index for b in blocks] == list(range(len(blocks)))
@@ -109,6 +115,59 @@ def test_another_campaign_in_the_same_folder_is_refused(conduct: Conduct) -> Non
     conduct("a")
     with pytest.raises(CampaignError, match="seed, selector differ"):
         conduct("a", seed=5, selector="random")
+
+
+def plan_cut_off(folder: Path, size: int) -> Path:
+    """A manifest of which the disk kept so many bytes."""
+    path = folder / MANIFEST
+    path.write_bytes(path.read_bytes()[:size])
+    return path
+
+
+@pytest.mark.parametrize("size", [0, 1, 100])
+def test_a_manifest_that_was_cut_off_says_what_to_do(conduct: Conduct, size: int) -> None:
+    """Before the first block: remove it; with a table beside it: the folder. What is said helps."""
+    whole = conduct("whole")
+    with pytest.raises(KeyboardInterrupt):
+        conduct("a", fails_at=0)
+    path = plan_cut_off(whole.folder.parent / "a", size)
+    with pytest.raises(
+        CampaignError, match=r"campaign.json: .*empty, torn.*remove campaign.json and give the command again"
+    ):
+        conduct("a")
+    path.unlink()
+    assert table(conduct("a").folder) == table(whole.folder)
+    plan_cut_off(path.parent, size)
+    with pytest.raises(CampaignError, match=r"torn.*remove .*a to begin anew, or give another --out"):
+        conduct("a")
+
+
+@pytest.mark.parametrize("text", ["[]", "7", '{"schema": 1}', '{"schema": 1, "regimes": 3}'])
+def test_a_manifest_that_is_no_plan_is_refused(conduct: Conduct, text: str) -> None:
+    """Though it is JSON."""
+    folder = conduct("a").folder
+    (folder / MANIFEST).write_text(text, encoding="utf-8")
+    with pytest.raises(CampaignError, match="no plan"):
+        read_manifest(folder)
+
+
+def test_a_kill_while_the_manifest_is_written_leaves_the_old_one_or_the_new_one(
+    conduct: Conduct, toy_plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever had been written when the process died: before the file is on the disk it has another name."""
+    folder = conduct("a").folder
+    before = (folder / MANIFEST).read_bytes()
+
+    def killed(_: int) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fsync", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_manifest(folder, replace(toy_plan, seed=9))
+    assert (folder / MANIFEST).read_bytes() == before
+    monkeypatch.undo()
+    write_manifest(folder, replace(toy_plan, seed=9))
+    assert read_manifest(folder).seed == 9
 
 
 def test_files_that_changed_are_refused(conduct: Conduct, tmp_path: Path) -> None:
@@ -238,12 +297,129 @@ def test_parquet_where_pyarrow_is_there(conduct: Conduct) -> None:
 
 def test_an_action_that_cannot_be_loaded_is_bad_input(conduct: Conduct, tmp_path: Path) -> None:
     """Named by the location file, not by a lost worker."""
-    from coordinator.campaign.plan import digest
-    from tests.campaign.conftest import SERVICES, TASK
-
     other = tmp_path / "services.toml"
     other.write_text(
         SERVICES.read_text(encoding="utf-8").replace("toy_actions:prepare", "no_such_module:prepare"), encoding="utf-8"
     )
     with pytest.raises(CampaignError, match="no_such_module"):
         conduct("a", services=str(other), digests={"task": digest(TASK), "services": digest(other)})
+
+
+def test_j_is_made_with_the_target_and_rho_that_were_given(conduct: Conduct) -> None:
+    """Else with the target that the task file declares: cost is that of the hardest regime which still reaches it."""
+    campaign = conduct("a", selector="round_robin", runs=240)
+    task, plan = campaign.bench.task, campaign.plan
+    assert campaign.result()["judged"]["look"]["target"] == 0.9  # declared, if only by leaving it out
+    sets = []
+    for options in ({}, {"target": 0.3}, {"target": 0.6}, {"target": 0.99}, {"rho": 0.25}):
+        summary = Summary.of(task, campaign.table.rows(), options=options)
+        result = result_of(campaign.folder, plan, summary, {})
+        judged, tallies = result["judged"]["look"], summary.estimates.of("look")
+        target = options.get("target", 0.9)
+        expected = compare(tallies, Question("wall", target, options.get("rho")))
+        assert (judged["cost"], judged["target"], judged["regimes"]) == ("wall", target, ["easy", "rough"])
+        assert judged["rho"] == pytest.approx(expected.rho)
+        assert result["J"]["look"] == {f.action: round(f.j, 6) if isfinite(f.j) else None for f in expected.figures}
+        inside = {a: [c for c, t in by.items() if t.interval()[0] >= target] for a, by in tallies.items()}
+        assert judged["meet_target"] == {a: list(map(regime_of, met)) for a, met in inside.items() if met}
+        for f in expected.figures:
+            assert f.reliability == min(tally.reliability for tally in tallies[f.action].values())
+            if f.scenario is not None:
+                there = tallies[f.action][f.scenario]
+                assert there.reliability == min(tallies[f.action][c].reliability for c in inside[f.action])
+                assert f.cost == there.wall.mean
+        said = text_of({**result, "chosen": {"look": result["chosen"]["look"]}})
+        assert (f"no action surely reaches R {target:g}" in said) == (not judged["meet_target"])
+        assert (f"(below R {target:g})" in said) == (0 < len(judged["meet_target"]) < 3)
+        sets.append(sorted(map(len, inside.values())))
+    assert sets[1] == [2, 2, 2]  # the targets tell regimes and actions apart
+    assert sets[2] not in (sets[1], sets[3])
+    assert sets[3] == [0, 0, 0]
+    one = comparisons(task, summary.estimates.tallies, "rough")["look"]
+    assert one.scenarios == ("regime=rough",)
+    assert all(f.admissible for f in one.figures), "in one regime the declared target rules nobody out"
+
+
+COUNTING = """
+schema = 1
+[actions.look_quick]
+values = { hard = false }
+[actions.look_twice]
+values = { hard = false, count = 2 }
+[actions.look_long]
+values = { hard = false, count = 16 }
+[actions.grip_soft]
+values = { force = 1.0 }
+[actions.grip_hard]
+values = { force = 4.0 }
+"""
+
+
+def test_a_count_is_a_cost_in_campaigns_and_runs_alike(
+    conduct: Conduct, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Declared in the task file: how many images a run averaged, as it reports, 1 where it reports nothing."""
+    monkeypatch.chdir(tmp_path)
+    text = TASK.read_text(encoding="utf-8").replace('"look_long"]', '"look_long"]\ncost = "count"')
+    (task := tmp_path / "fetch.toml").write_text(text, encoding="utf-8")
+    (mock := tmp_path / "mock.toml").write_text(COUNTING, encoding="utf-8")
+    digests = {key: digest(path) for key, path in (("task", task), ("services", SERVICES), ("mock", mock))}
+    counted = {"look_quick": 1.0, "look_twice": 2.0, "look_long": 16.0}
+    campaign = conduct("a", task=str(task), mock=str(mock), digests=digests, selector="round_robin")
+    for row in campaign.table.rows():
+        assert row.throw is not None
+        assert row.throw.runs[0].cost == counted[row.throw.runs[0].action]
+    result = campaign.result()
+    assert result["judged"]["look"]["cost"] == "count"
+    assert result["J"]["look"] == {action: count / 16 for action, count in counted.items()}
+    told = ["run", str(task), "--services", str(SERVICES), "--mode", "lockstep", "--mock", str(mock), "--quiet"]
+    assert main([*told, "--runs", "6", "--learn", "run.db", "--selector", "round_robin"]) == 0
+    for path in (Path("run.db"), Path(result["estimates"])):
+        kept = EstimatesFile(path).read()
+        assert kept.question("look") == Question("count", 0.9)
+        for action, by_context in kept.estimates.of("look").items():
+            assert {tally.cost("count").mean for tally in by_context.values()} == {counted[action]}
+    learner = EstimatesFile(Path("run.db")).read().states("round_robin")["look"]["learners"]["regime=easy"]
+    assert learner["cost"] == [2 * count for count in counted.values()]
+
+
+@pytest.mark.parametrize("selector", ["random", "round_robin", "ucb1"])
+def test_learned_show_judges_as_the_campaign_did(
+    conduct: Conduct, selector: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the cost, the target and the rho that its estimates file holds, also if no selector learned by them."""
+    monkeypatch.chdir(tmp_path)
+    options = {"target": 0.6, "rho": 0.2}
+    result = conduct("a", selector=selector, runs=120, options=options).result()
+    assert main(["learned", "show", result["estimates"], "--json", "shown.json"]) == 0
+    shown = json.loads(Path("shown.json").read_text(encoding="utf-8"))["primitive_tasks"]
+    assert shown["grip"]["cost"] == "value:force"
+    for task, actions in result["J"].items():
+        about = shown[task]
+        found = {row["action"]: None if row["J"] is None else round(row["J"], 6) for row in about["actions"]}
+        assert found == actions
+        assert (about["target"], about["rho"]) == (0.6, 0.2)
+
+
+def test_a_damaged_estimates_file_says_that_it_can_be_made_again(conduct: Conduct) -> None:
+    """It is derived from the table; nobody's additions are wiped unasked."""
+    campaign = conduct("a")
+    path = Path(campaign.result()["estimates"])
+    whole = EstimatesFile(path).read().estimates
+    path.write_bytes(b"no database at all, but long enough to be looked at" * 9)
+    with pytest.raises(CampaignError, match=r"not a database.*If it is removed, the same command makes it again"):
+        campaign.result()
+    path.unlink()
+    campaign.result()
+    assert EstimatesFile(path).read().estimates == whole
+
+
+def test_a_cost_that_no_result_has_is_said(conduct: Conduct, tmp_path: Path) -> None:
+    """J is 1 - R then, which nobody would see."""
+    task = tmp_path / "fetch.toml"
+    task.write_text(TASK.read_text(encoding="utf-8").replace("value:force", "value:forse"), encoding="utf-8")
+    campaign = conduct("a", task=str(task), runs=24, digests={"task": digest(task), "services": digest(SERVICES)})
+    result = campaign.result()
+    assert result["judged"]["grip"]["uncosted"] == ["grip_soft"]
+    result["chosen"]["grip"]["grip_hard"] = 1  # primitive tasks without a choice are not printed
+    assert "grip_soft: no run reported value:forse" in text_of(result)

@@ -221,7 +221,7 @@ async def test_watch_tells_what_happens_until_the_end(petrobot: Terminal) -> Non
         (("force", "work", "start"), "no way out of work is named 'start'"),
         (("force", "jobs", "done"), "no action place is named 'jobs'"),
         (("break", "nowhere"), "no place or transition is named 'nowhere'"),
-        (("token", "jobs", "0"), "0 tokens"),
+        (("token", "jobs", "0"), "0 changes nothing"),
         (("token", "job", "+1"), "did you mean 'jobs'"),
         (("override", "work"), "or say --free"),
         (("override", "work", "fly"), "no alternative is named 'fly'"),

@@ -81,7 +81,12 @@ def test_good_file_reads() -> None:
         ("deadline = 2.0", "deadline = nan", "primitive_tasks.look.deadline", "finite"),
         ("deadline = 2.0", "deadline = -1", "primitive_tasks.look.deadline", "positive"),
         ("deadline = 2.0", "deadline = true", "primitive_tasks.look.deadline", "not a number"),
-        ("deadline = 2.0", 'deadline = 2.0\ncost = "money"', "primitive_tasks.look.cost", "wall, cpu or value:NAME"),
+        (
+            "deadline = 2.0",
+            'deadline = 2.0\ncost = "money"',
+            "primitive_tasks.look.cost",
+            "wall, cpu, count or value:NAME",
+        ),
         (
             "deadline = 2.0",
             "deadline = 2.0\ntarget_reliability = 2",

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import re
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +18,7 @@ from coordinator.learning.estimate import Observation, Tally, merge
 from coordinator.learning.intervals import clopper_pearson, wilson
 from coordinator.learning.moments import Moments
 from coordinator.learning.sample import SIZE, Sample, quantile
+from coordinator.learning.selectors import cost_of
 from coordinator.task import Executed, Status
 from tests.learning.conftest import COUNTED, OBSERVATIONS, tally_of
 
@@ -149,6 +153,17 @@ def test_cost_by_measure(measure: str, mean: float) -> None:
         tally_of(seen).cost("pictures")
 
 
+@given(OBSERVATIONS, st.lists(st.none() | st.integers(0, 9), min_size=25, max_size=25))
+def test_a_count_is_what_runs_report_and_else_one(seen: list[Observation], counts: list[int | None]) -> None:
+    """Summed in a tally as the learners take it run by run; what was preempted and counts none has no cost."""
+    told = [replace(one, values={} if n is None else {"count": float(n)}) for one, n in zip(seen, counts, strict=False)]
+    counted = [one for one in told if one.status is not None and one.executed is not Executed.NO]
+    found = tally_of(told).cost("count")
+    assert found.n == len(counted)
+    assert found.total == pytest.approx(sum(cost_of(one, "count") for one in counted))
+    assert [cost_of(one, "count") for one in counted] == [one.values.get("count", 1.0) for one in counted]
+
+
 @given(st.integers(0, 60), st.integers(0, 60), st.sampled_from([0.8, 0.9, 0.95]))
 def test_intervals_are_the_known_ones(successes: int, others: int, level: float) -> None:
     """Wilson and Clopper-Pearson as scipy has them; the exact interval is never the shorter at its ends' coverage."""
@@ -203,3 +218,50 @@ def test_samples_merge_in_any_order(parts: list[list[int]]) -> None:
     for sample in reversed(made):
         backward = sample.merged(backward)
     assert forward == backward
+
+
+def plain_of(*seen: Observation) -> dict[str, Any]:
+    """Plain data of the tally of some runs, as a file holds it."""
+    plain: dict[str, Any] = json.loads(json.dumps(tally_of(list(seen)).to_plain()))
+    return plain
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"counts": [["success", "", -5]]}, "-5 runs: a whole number"),
+        ({"counts": [["success", "", 1.5]]}, "1.5 runs"),
+        ({"counts": [["success", "", True]]}, "True runs"),
+        ({"counts": [["success", "", 3]]}, "3 runs ended with success, but 2 such"),
+        ({"counts": [["error", "", 2]]}, "0 runs ended with success, but 2 such"),
+        ({"durations": {"success": [-2, 1.0, 0.0, 1.0, 1.0]}}, "-2 numbers"),
+        ({"durations": {"success": [2, 1.0, -1.0, 1.0, 1.0]}}, "no moments"),
+        ({"durations": {"success": [2, float("nan"), 0.0, 1.0, 1.0]}}, "no moments"),
+        ({"durations": {"success": [2, 9.0, 0.0, 1.0, 1.0]}}, "no moments"),
+        ({"durations": {"success": [2, -1.0, 0.0, -1.0, -1.0]}}, "seconds below 0"),
+        ({"durations": {"success": [2, 1.0, 0.0, 1.0, 1.0], "lost": [1, 1.0, 0.0, 1.0, 1.0]}}, "none of success"),
+        ({"cpu": [3, 1.0, 0.0, 1.0, 1.0]}, "3 numbers called cpu: a whole number from 0 to 2"),
+        ({"values": {"images": [3, 1.0, 0.0, 1.0, 1.0]}}, "called images"),
+        ({"waited": [3, 1.0, 0.0, 1.0, 1.0]}, "3 waits"),
+        ({"not_executed": {"dead": -1}}, "-1 runs that never began"),
+        ({"unknown": 3}, "from 0 to 2"),
+        ({"corrected": -1}, "-1 corrections"),
+        ({"changes": 1}, "1 changes made it, but 2 runs"),
+        ({"sample": [[i, 1.0, -1.0, "success"] for i in range(3)]}, "3 runs in the sample"),
+    ],
+)
+def test_numbers_that_no_runs_could_have_left_are_refused(change: dict[str, Any], said: str) -> None:
+    """One bad number, merged, would spoil the figures of everything that it is added to."""
+    run = Observation(Status.SUCCESS, 1.0)
+    assert Tally.of_plain(plain_of(run, run)).runs == 2
+    with pytest.raises(ValueError, match=re.escape(said)):
+        Tally.of_plain({**plain_of(run, run), **change})
+
+
+@given(OBSERVATIONS, COUNTED, st.sampled_from(Status), OBSERVATIONS)
+def test_whatever_runs_leave_is_taken_back(
+    seen: list[Observation], deferred: Observation, status: Status, others: list[Observation]
+) -> None:
+    """Corrected and merged, too: the check refuses nothing that is true."""
+    tally = merge(tally_of([*seen, deferred]).correcting(deferred, status, "seen later"), tally_of(others, "other"))
+    assert Tally.of_plain(json.loads(json.dumps(tally.to_plain()))) == tally

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import sqlite3
+from contextlib import closing
 from itertools import permutations
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ from hypothesis import strategies as st
 from coordinator.experience.estimates_file import EstimatesError, EstimatesFile, Kept
 from coordinator.learning.estimate import Key, Observation
 from coordinator.learning.learning import Estimates
+from coordinator.learning.objective import Question
 from coordinator.learning.passage import Flow, PassageKey
 from coordinator.learning.selectors import make
 from coordinator.task import Status
@@ -191,7 +194,13 @@ def test_a_damaged_selector_is_not_taken_in(tmp_path: Path) -> None:
     """One clear error, and the file that should have taken it is as it was."""
     one, other = file_of(tmp_path / "one.db", 2), EstimatesFile(tmp_path / "other.db")
     other.add(Estimates(), {"pick": state_of("ucb1", {"A": 3})})
-    for body in ("torn", "[]", '{"learners": {"A": {}}}'):
+    for body in (
+        "torn",
+        "[]",
+        '{"learners": {"A": {}}}',
+        '{"learners": {"A": {"k": -5}}}',
+        '{"learners": {"A": {"k": NaN}}}',
+    ):
         written(other.path, f"UPDATE selector SET state = '{body}'")
         with pytest.raises(EstimatesError, match="do not fit"):
             one.merge(other.path)
@@ -291,6 +300,12 @@ def written(path: Path, statements: str) -> Path:
     return path
 
 
+def asked_of(path: Path, statement: str) -> Path:
+    """A file that says by what actions were judged, spoilt."""
+    EstimatesFile(path).add(gained(2), {}, asked={"pick": Question("cpu", 0.8, 0.1)})
+    return written(path, statement)
+
+
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
@@ -301,9 +316,12 @@ def written(path: Path, statements: str) -> Path:
         (lambda p: file_of(p, 2) and written(p, "UPDATE tally SET body = '{}'"), "do not fit"),
         (lambda p: file_of(p, 2) and written(p, "UPDATE tally SET body = 'x'"), "do not fit"),
         (lambda p: file_of(p, 2) and written(p, "DROP TABLE tally"), "no such table"),
+        (lambda p: asked_of(p, "UPDATE question SET cost = 'pictures'"), "'pictures' is no cost measure"),
+        (lambda p: asked_of(p, "UPDATE question SET target = 7"), "7.0 is no target"),
+        (lambda p: asked_of(p, "UPDATE question SET rho = -3"), "-3.0 is no weight"),
         (lambda p: p.mkdir(), "unable to open"),
     ],
-    ids=["text", "foreign", "newer", "older", "empty body", "torn body", "no table", "folder"],
+    ids=["text", "foreign", "newer", "older", "empty body", "torn body", "no table", "cost", "target", "rho", "folder"],
 )
 def test_a_bad_file_gives_one_clear_error(tmp_path: Path, spoil: Any, said: str) -> None:
     """File, what is wrong, what to do; and it is left as it was."""
@@ -316,6 +334,201 @@ def test_a_bad_file_gives_one_clear_error(tmp_path: Path, spoil: Any, said: str)
         EstimatesFile(tmp_path / "good.db").merge(path)
 
 
+@pytest.mark.parametrize(
+    ("table", "old", "new", "version", "said"),
+    [
+        ("tally", '[["success","",2]]', '[["success","",-5]]', 999, "pick, pick_fast (regime=A): -5 runs"),
+        ("tally", '"unknown":0', '"unknown":7', 2, "pick, pick_fast (regime=A): 7 runs of which"),
+        ("tally", '"unknown"', '"unheard"', 2, "'unknown' is missing"),
+        ("tally", "{", "{", 999, "version 999 of what was changed 2 times"),
+        ("flow", "[2,", "[-2,", 999, "transition begin (regime=A): -2 firings"),
+        ("flow", "[2, [2,", "[1, [2,", 1, "2 waits: a whole number from 0 to 1"),
+        ("flow", "[2,", "[2,", 999, "version 999"),
+    ],
+)
+def test_a_corrupted_file_poisons_no_other(
+    tmp_path: Path, table: str, old: str, new: str, version: int, said: str
+) -> None:
+    """It is refused by name, whatever its version, and the file that should have taken it is as it was."""
+    one, other = file_of(tmp_path / "one.db", 3), file_of(tmp_path / "other.db", 2)
+    written(other.path, f"UPDATE {table} SET body = replace(body, '{old}', '{new}'), version = {version}")
+    before = known(one)
+    for use in (other.read, lambda: one.merge(other.path)):
+        with pytest.raises(EstimatesError) as fault:
+            use()
+        assert said in str(fault.value)
+        assert str(other.path) in str(fault.value)
+    assert known(one) == before
+
+
+# --- what was asked, and files of schema 1 ------------------------------------------------------------------------------
+
+
+def test_what_actions_are_judged_by_is_kept(tmp_path: Path) -> None:
+    """Per origin: a file's own says the last word, of others the one that was asked most often; all that differ are known."""
+    one, other, third = (EstimatesFile(tmp_path / f"{i}.db") for i in range(3))
+    images, wall = Question("value:images", 0.8, 0.1), Question("wall", 0.9)
+    assert one.read().question("pick") == Question()
+    for question in (wall, images):
+        one.add(gained(1), {}, asked={"pick": question})
+    other.add(gained(1), {}, asked={"pick": wall, "place": images})
+    assert one.read().asked == {"pick": (images,)}
+    for _ in range(2):
+        one.merge(other.path)
+        other.merge(one.path)
+        third.merge(one.path)
+    assert one.read().asked == {"pick": (images, wall), "place": (images,)}
+    assert other.read().asked == {"pick": (wall, images), "place": (images,)}
+    assert third.read().question("pick") == images
+    one.reset("pick")
+    one.merge(other.path)
+    assert set(one.read().asked) == {"place"}
+
+
+SCHEMA_1 = """
+CREATE TABLE about(name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
+CREATE TABLE tally(origin TEXT, primitive_task TEXT, action TEXT, context TEXT, version INTEGER NOT NULL, body TEXT NOT NULL,
+  PRIMARY KEY(origin, primitive_task, action, context)) WITHOUT ROWID;
+CREATE TABLE flow(origin TEXT, task TEXT, transition_name TEXT, context TEXT, version INTEGER NOT NULL, body TEXT NOT NULL,
+  PRIMARY KEY(origin, task, transition_name, context)) WITHOUT ROWID;
+CREATE TABLE selector(primitive_task TEXT, name TEXT, trials REAL NOT NULL, state TEXT NOT NULL,
+  PRIMARY KEY(primitive_task, name)) WITHOUT ROWID;
+CREATE TABLE forgotten(origin TEXT, primitive_task TEXT, PRIMARY KEY(origin, primitive_task)) WITHOUT ROWID;
+CREATE TABLE mission(id TEXT PRIMARY KEY, records INTEGER NOT NULL) WITHOUT ROWID;
+PRAGMA application_id = 1885697138;
+PRAGMA user_version = 1;
+"""
+"""As petrobot wrote it before there was a schema 2."""
+
+
+def old_file(path: Path, good: int, origin: str) -> EstimatesFile:
+    """A file of schema 1 with so many successes, and a selector that was learned by images."""
+    written(path, SCHEMA_1)
+    tally, state = gained(good, salt=origin).tally(KEY), state_of("ucb1", {"A": 3}) | {"cost": "value:images"}
+    flow = gained(good).flows[PassageKey("sorting", "begin", "regime=A")]
+    with closing(sqlite3.connect(path)) as db, db:
+        rows = [("origin", origin), ("generation", "1")]
+        db.executemany("INSERT INTO about VALUES (?, ?)", rows)
+        where = ("pick", "pick_fast", "regime=A", tally.changes, json.dumps(tally.to_plain()))
+        db.execute("INSERT INTO tally VALUES (?, ?, ?, ?, ?, ?)", (origin, *where))
+        where = ("sorting", "begin", "regime=A", flow.fired, json.dumps([flow.fired, flow.waits.to_plain()]))
+        db.execute("INSERT INTO flow VALUES (?, ?, ?, ?, ?, ?)", (origin, *where))
+        db.execute("INSERT INTO selector VALUES (?, ?, ?, ?)", ("pick", "ucb1", 3.0, json.dumps(state)))
+    return EstimatesFile(path)
+
+
+def schema_of(path: Path) -> int:
+    """Of a file on the disk."""
+    with closing(sqlite3.connect(path)) as db:
+        return int(db.execute("PRAGMA user_version").fetchone()[0])
+
+
+def test_a_file_of_schema_1_goes_on(tmp_path: Path) -> None:
+    """It is read as it is, and becomes one of schema 2 when something is added; nothing is lost or counted twice."""
+    old = old_file(tmp_path / "old.db", 4, "ab12")
+    kept = old.read()
+    assert (kept.generation, kept.estimates.tally(KEY).runs, kept.question("pick").measure) == (1, 4, "value:images")
+    assert schema_of(old.path) == 1
+    old.add(gained(3, salt="more"), {}, asked={"pick": Question("cpu", 0.7)})
+    kept = old.read()
+    assert schema_of(old.path) == 2
+    assert (kept.origin, kept.generation, kept.estimates.tally(KEY).runs) == ("ab12", 2, 7)
+    assert kept.question("pick") == Question("cpu", 0.7)
+    assert set(kept.states("ucb1")) == {"pick"}
+
+
+def test_old_and_new_files_merge(tmp_path: Path) -> None:
+    """Either way; the old one that is only read stays as it is."""
+    old, new = old_file(tmp_path / "old.db", 4, "ab12"), file_of(tmp_path / "new.db", 5)
+    for _ in range(2):
+        new.merge(old.path)
+    assert schema_of(old.path) == 1
+    assert new.read().estimates.tally(KEY).runs == 9
+    old.merge(new.path)
+    old.merge(old_file(tmp_path / "copy.db", 4, "ab12").path)
+    assert schema_of(old.path) == 2
+    assert known(old) == known(new)
+
+
+# --- campaigns: origins that are closed ---------------------------------------------------------------------------------
+
+RUNS = "campaign/0123"
+"""The origin of one campaign, wherever it was run."""
+
+
+def campaign_file(path: Path, good: int = 12) -> EstimatesFile:
+    """What a campaign writes beside its table."""
+    file = EstimatesFile(path, RUNS)
+    selectors = {"pick": state_of("nikolic_fu", {"regime=A": good})}
+    file.put_closed(RUNS, gained(good, salt=RUNS), selectors, {"pick": Question("value:images", 0.8)})
+    return file
+
+
+def test_what_is_added_to_a_campaigns_file_is_not_the_campaigns(tmp_path: Path) -> None:
+    """The same campaign on two machines, both go on, and meet: its runs count once, each one's own too."""
+    one, other = (campaign_file(tmp_path / f"m{i}.db") for i in (1, 2))
+    one.add(gained(6, salt="one"), {})
+    one.add(gained(1, salt="one again"), {})
+    other.add(gained(9, salt="other"), {})
+    both = EstimatesFile(tmp_path / "mm.db")
+    for _ in range(2):
+        both.merge(one.path)
+        both.merge(other.path)
+    other.merge(both.path)
+    assert known(both) == known(other)
+    assert both.read().estimates.tally(KEY).runs == 12 + 7 + 9
+    assert both.read().question("pick") == Question("value:images", 0.8)
+
+
+def test_a_campaign_that_is_written_again_wipes_nothing(tmp_path: Path) -> None:
+    """What was run, learned, frozen or asked since stays; nothing counts twice."""
+    file = campaign_file(tmp_path / "m.db")
+    whole = file.read()
+    campaign_file(file.path)
+    assert file.read() == whole
+    learned = state_of("nikolic_fu", {"regime=A": 30}) | {"frozen": True}
+    file.add(gained(6, salt="run"), {"pick": learned}, asked={"pick": Question("wall", 0.5)})
+    whole = file.read()
+    campaign_file(file.path)
+    assert file.read() == whole
+    assert whole.estimates.tally(KEY).runs == 18
+    assert whole.states("nikolic_fu")["pick"] == learned
+    assert whole.asked["pick"] == (Question("wall", 0.5), Question("value:images", 0.8))
+
+
+@pytest.mark.parametrize("goes_on", [False, True])
+def test_a_campaign_that_was_reset_stays_forgotten(tmp_path: Path, goes_on: bool) -> None:
+    """When it is written again, and when another machine's file of it comes in; also if a run was added before."""
+    file, other = (campaign_file(tmp_path / f"m{i}.db") for i in (1, 2))
+    if goes_on:
+        file.add(gained(6, salt="run"), {})
+    file.reset()
+    for again in (lambda: campaign_file(file.path), lambda: file.merge(other.path)):
+        again()
+        kept = file.read()
+        assert not kept.estimates.tallies
+        assert not kept.estimates.flows
+        assert not kept.selectors
+        assert not kept.asked
+    file.add(gained(2, salt="afresh"), {})
+    other.merge(file.path)
+    assert other.read().estimates.tally(KEY).runs == file.read().estimates.tally(KEY).runs == 2
+
+
+def test_a_campaigns_file_of_schema_1_is_closed_when_it_goes_on(tmp_path: Path) -> None:
+    """So a run that is added after the update merges; what the campaign writes again does not take away what is there."""
+    one, other = (old_file(tmp_path / f"m{i}.db", 12, RUNS) for i in (1, 2))
+    one.add(gained(6, salt="one"), {})
+    assert one.read().origin != RUNS
+    campaign_file(other.path)
+    other.add(gained(9, salt="other"), {})
+    one.merge(other.path)
+    assert one.read().estimates.tally(KEY).runs == 27
+    mixed = old_file(tmp_path / "mixed.db", 18, RUNS)  # a run had been added to it under schema 1
+    campaign_file(mixed.path)
+    assert mixed.read().estimates.tally(KEY).runs == 18
+
+
 def test_merging_from_nowhere_is_refused(tmp_path: Path) -> None:
     """And makes no file."""
     with pytest.raises(EstimatesError, match="no such file"):
@@ -323,24 +536,38 @@ def test_merging_from_nowhere_is_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "one.db").exists()
 
 
-@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(steps=st.lists(st.tuples(st.integers(0, 2), st.sampled_from("amM"), st.integers(1, 3)), max_size=12))
+@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(steps=st.lists(st.tuples(st.integers(0, 2), st.sampled_from("amMc"), st.integers(1, 3)), max_size=10))
 def test_files_that_met_agree(steps: list[tuple[int, str, int]], tmp_path: Path) -> None:
-    """Whatever was added where and merged whither: after all have met, all know every run exactly once."""
+    """Whatever was added where and merged whither, one file begun under schema 1, one by a campaign, campaigns given again
+    anywhere: after all have met, all know every run exactly once."""
     folder = tmp_path / "crdt"
     for old in folder.glob("*") if folder.exists() else ():
         old.unlink()
-    files = [EstimatesFile(folder / f"{i}.db", f"origin{i}") for i in range(3)]
-    added = 3
-    for i, file in enumerate(files):
-        file.add(gained(1, salt=f"begin{i}"), {})
+    folder.mkdir(exist_ok=True)
+
+    def campaign(number: int, file: EstimatesFile) -> None:
+        """Each is of 10 more runs than the one before; it may stand in several files."""
+        runs = gained(10 * number, salt=f"campaign{number}")
+        file.put_closed(f"campaign/{number}", runs, {}, {"pick": Question("cpu", 0.1 * number)})
+        campaigns.add(number)
+
+    campaigns: set[int] = set()
+    begun = [EstimatesFile(folder / "1.db", "campaign/1"), EstimatesFile(folder / "2.db", "origin2")]
+    files = [old_file(folder / "0.db", 1, "origin0"), *begun]
+    campaign(1, files[1])
+    files[2].add(gained(1, salt="begin"), {})
+    added = 2
     for number, (i, what, n) in enumerate(steps):
         if what == "a":
             files[i].add(gained(n, salt=str(number)), {})
             added += n
+        elif what == "c":
+            campaign(n, files[i])
         else:
             files[i].merge(files[(i + n) % 3].path)
     for _ in range(2):
         for i in range(3):
             files[i].merge(files[(i + 1) % 3].path)
-    assert {f.read().estimates.tally(KEY).runs for f in files} == {added}
+    assert {f.read().estimates.tally(KEY).runs for f in files} == {added + 10 * sum(campaigns)}
+    assert len({frozenset(f.read().asked.get("pick", ())) for f in files}) == 1

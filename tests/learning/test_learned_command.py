@@ -13,10 +13,14 @@ from coordinator.engine import Engine
 from coordinator.experience.estimates_file import EstimatesFile
 from coordinator.experience.learning_session import LearningSession, LearningSetting, session_of
 from coordinator.launch import resumed_mission, with_runs
-from coordinator.learning.estimate import Key
+from coordinator.learning.estimate import Key, Observation, Tally
+from coordinator.learning.learning import Estimates
+from coordinator.learning.objective import Question
 from coordinator.record.journal import JournalWriter, read_journal
 from coordinator.record.recording import JournalStore
+from coordinator.task import Status
 from tests.learning.cell import TASK_FILE, directory, run, sorting
+from tests.learning.conftest import tally_of
 
 SERVICES = """
 schema = 1
@@ -187,9 +191,108 @@ def test_verbs_of_learned(cell: Path, capsys: pytest.CaptureFixture[str]) -> Non
         (["merge", "one.db", "none.db"], "no such file"),
         (["reset", "one.db", "fly"], "no primitive task 'fly'"),
         (["show", "one.db", "--cost", "pictures"], "no cost measure"),
+        (["show", "one.db", "--cost", "value:"], "no cost measure"),
+        (["show", "two.db", "--cost", "value:nosuch"], "the results have: value:tries, value:weight"),
+        (["show", "two.db", "pick", "--cost", "value:tries"], "the results have: value:weight"),
+        (["show", "one.db", "--target", "7"], "7 is not a number of more than 0 and at most 1"),
+        (["show", "one.db", "--rho", "-3"], "-3 is not a number of at least 0"),
+        (["show", "one.db", "--budget", "nan"], "nan is not a number of more than 0"),
+        (["show", "one.db", "--context", "nowhere"], "knows the contexts 'regime=A'"),
+        (["task", "one.db", str(TASK_FILE), "--context", "nowhere"], "knows the contexts 'regime=A'"),
     ):
         assert main(["learned", *arguments]) == 2
         assert said in capsys.readouterr().err
+
+
+def told(path: Path, capsys: pytest.CaptureFixture[str], *more: str) -> tuple[dict[str, Any], str]:
+    """What `learned show` writes and prints."""
+    capsys.readouterr()
+    out = path.with_suffix(".json")
+    assert main(["learned", "show", str(path), "--json", str(out), *more]) == 0
+    shown: dict[str, Any] = json.loads(out.read_text(encoding="utf-8"))["primitive_tasks"]
+    return shown, " ".join(capsys.readouterr().out.split())
+
+
+def shares(seconds: float, **by_context: tuple[int, int]) -> dict[str, Tally]:
+    """Tallies of (successes, failures) by context."""
+    ends = {c: [Status.SUCCESS] * good + [Status.FAILURE] * bad for c, (good, bad) in by_context.items()}
+    return {c: tally_of([Observation(status, seconds) for status in statuses]) for c, statuses in ends.items()}
+
+
+def file_of(path: Path, asked: Question | None = None, **actions: dict[str, Tally]) -> Path:
+    """An estimates file of one primitive task."""
+    tallies = {Key("pick", a, c): tally for a, by in actions.items() for c, tally in by.items()}
+    EstimatesFile(path).add(Estimates(tallies), {}, asked={"pick": asked} if asked else None)
+    return path
+
+
+def test_shown_is_the_worst_case_and_each_context(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Pooled over unequal shares of easy and hard, the better action would look the worse one."""
+    good = shares(1.0, easy=(98, 2), hard=(560, 440))
+    bad = shares(1.0, easy=(900, 100), hard=(40, 60))
+    shown, text = told(file_of(tmp_path / "x.db", good=good, bad=bad), capsys)
+    by_name = {row["action"]: row for row in shown["pick"]["actions"]}
+    assert by_name["good"]["R_over_all_runs"] < by_name["bad"]["R_over_all_runs"]
+    assert [by_name[a]["R"] for a in ("good", "bad")] == [0.56, 0.40]
+    assert [by_name[a]["J"] for a in ("good", "bad")] == pytest.approx([1.44, 1.60])
+    assert shown["pick"]["best"] == "good"
+    parts = {(row["action"], row["context"]): row for row in shown["pick"]["by_context"]}
+    assert {key: row["R"] for key, row in parts.items()} == {
+        ("good", "easy"): 0.98, ("good", "hard"): 0.56, ("bad", "easy"): 0.9, ("bad", "hard"): 0.4,
+    }  # fmt: skip
+    assert all(row["J"] == pytest.approx(2 - row["R"]) for row in parts.values())
+    assert "good * 1100 0.56" in text and "hard 1000 0.56" in text and "easy 100 0.98" in text
+    alone, text = told(tmp_path / "x.db", capsys, "--context", "easy")
+    assert {row["action"]: row["R"] for row in alone["pick"]["actions"]} == {"good": 0.98, "bad": 0.9}
+    assert "hard" not in text
+
+
+def test_shown_by_the_target_that_the_file_holds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """So without being asked again; `--target` asks otherwise, and one context by itself has none."""
+    path = tmp_path / "x.db"
+    act = shares(1.0, calm=(990, 10), windy=(900, 100), storm=(500, 500))
+    act["windy"] = shares(2.0, windy=(900, 100))["windy"]
+    file_of(path, Question("wall", 0.85, 0.25), act=act, weak=shares(1.0, calm=(5, 5), windy=(5, 5), storm=(5, 5)))
+    shown, text = told(path, capsys)
+    row, weak = shown["pick"]["actions"]
+    assert (shown["pick"]["target"], shown["pick"]["rho"]) == (0.85, 0.25)
+    assert (row["scenario"], row["scenarios"], row["C"], row["worst"]) == ("windy", ["calm", "windy"], 2.0, "storm")
+    assert row["J"] == pytest.approx(1 - 0.5 + 0.25 * 2.0)
+    assert weak["J"] is None
+    assert "act meets R 0.85 in: calm, windy, where it costs 2 at most" in text
+    assert "target R 0.85" in text and "weak does not surely reach R 0.85 in any context: no J" in text
+    shown, text = told(path, capsys, "--target", "0.995", "--rho", "0")
+    assert shown["pick"]["target_unmet"]
+    assert [row["J"] for row in shown["pick"]["actions"]] == [0.5, 0.5]
+    assert "no action surely reaches R 0.995 in any context: judged without a target" in text
+    assert told(path, capsys, "--context", "storm")[0]["pick"]["target"] is None
+
+
+def test_what_a_table_cannot_say_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Contexts that not all actions share, costs that no result has, other questions of other machines."""
+    some, none = shares(1.0, A=(5, 5), B=(9, 1)), shares(1.0, C=(5, 5))
+    _, text = told(file_of(tmp_path / "x.db", one=some, other=shares(1.0, A=(5, 5))), capsys)
+    assert "judged over the contexts in which all actions were run: A" in text
+    path = file_of(tmp_path / "y.db", Question("value:images"), one=some, other=none)
+    file_of(tmp_path / "z.db", Question("cpu", 0.8, 0.1), one=some)
+    EstimatesFile(path).merge(tmp_path / "z.db")
+    shown, text = told(path, capsys)
+    assert "no context in which all actions were run" in text
+    assert shown["pick"]["uncosted"] == ["one", "other"]
+    assert "one: no run reported value:images, so its cost is taken as 0" in text
+    assert "elsewhere it was judged by --cost cpu --target 0.8 --rho 0.1" in text
+    _, text = told(path, capsys, "--cost", "wall")
+    assert "no run reported" not in text
+
+
+def test_a_run_says_that_a_cost_was_never_reported(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The number that the task file names as cost is in no result: one line for each action, and what to correct."""
+    spoilt = cell / "sorting.toml"
+    spoilt.write_text(TASK_FILE.read_text(encoding="utf-8").replace("value:tries", "value:trees"), encoding="utf-8")
+    petrobot("--learn", "learned.db", runs=2)
+    assert "reported" not in capsys.readouterr().err
+    assert main(["run", str(spoilt), "--mode", "lockstep", "--mock", "mock.toml", "--quiet", "--learn", "x.db"]) == 0
+    assert "place: no run of place_soft reported value:trees" in capsys.readouterr().err
 
 
 def test_what_the_actions_come_to_in_the_task(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:

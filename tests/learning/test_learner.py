@@ -18,7 +18,7 @@ from coordinator.experience.learner import ContextError, Contexts, LearningSelec
 from coordinator.launch import Setting, lockstep_cell, with_runs
 from coordinator.learning.estimate import Key
 from coordinator.learning.learning import Learning
-from coordinator.learning.records import Choice, End, Passage, of_plain, to_plain
+from coordinator.learning.records import Choice, Correction, End, Passage, of_plain, to_plain
 from coordinator.learning.selectors import RULES
 from coordinator.mission.realtime import RealtimeMission
 from coordinator.operator.operation import Operation
@@ -181,6 +181,30 @@ def test_a_deferred_verdict_corrects_r_once(task: Task) -> None:
     tally = selector.learning.estimates.tally(key)
     assert (tally.reliability, tally.corrected, tally.runs) == (0.0, 1, 1)
     assert selector.learning.selectors["pick"].learner("regime=A").successes[0, 1] == 0.0
+
+
+def test_a_deferred_verdict_knows_how_many_trials_came_since(task: Task) -> None:
+    """Those of its own primitive task and context; a run that was cancelled is none."""
+    selector = learner(task, "tracking", seed=1)
+
+    def ended(run: str, action: str, status: Status | None, place: str = "pick", regime: str = "A") -> None:
+        selector.settled(0.0, State((0,), {"regime": regime}))
+        selector.instruction(0.0, StartRun(run, place, place, action, {}, 5.0))
+        record = RunRecorded(run, place, place, action, status, "", "", Executed.YES, 0.4, deferred=run == "pick#1")
+        selector.instruction(0.4, record)
+
+    ended("pick#1", "pick_slow", Status.SUCCESS)
+    ended("pick#2", "pick_fast", Status.SUCCESS)
+    ended("pick#3", "pick_fast", Status.FAILURE)
+    ended("pick#4", "pick_fast", None)
+    ended("pick#5", "pick_fast", Status.SUCCESS, regime="B")
+    ended("place#1", "place_soft", Status.SUCCESS, "place")
+    selector.instruction(1.0, Corrected("pick#1", "pick", "pick_slow", Status.SUCCESS, Status.FAILURE, "crooked"))
+    record = selector.records[-1]
+    assert isinstance(record, Correction)
+    assert record.age == 2
+    assert of_plain(json.loads(json.dumps(to_plain(record)))) == record
+    assert of_plain({k: v for k, v in to_plain(record).items() if k != "age"}) == replace(record, age=0)
 
 
 def test_alternatives_are_judged_in_a_context_or_over_scenarios(task: Task) -> None:

@@ -164,3 +164,64 @@ def test_more_images_averaged_cost_more_and_are_more_reliable() -> None:
     reach = cost_to_reach(found.figures, 0.95)
     assert reach is not None
     assert reach.action == "average_16"
+
+
+def shares(good: float, runs_: int, seconds: float = 1.0) -> Tally:
+    """So many runs with a share of successes."""
+    return runs(round(good * runs_), runs_ - round(good * runs_), seconds)
+
+
+@pytest.mark.parametrize(("easy", "hard"), [((50, 500), (500, 50)), ((500, 50), (50, 500)), ((200, 200), (200, 200))])
+def test_unequal_shares_of_easy_and_hard_do_not_reverse_the_order(easy: tuple[int, int], hard: tuple[int, int]) -> None:
+    """Simpson: better in each scenario is better in all, whoever was run where how often."""
+    found = compare(
+        {
+            "good": {"easy": shares(0.98, easy[0]), "hard": shares(0.56, hard[0])},
+            "bad": {"easy": shares(0.90, easy[1]), "hard": shares(0.40, hard[1])},
+        },
+        Question(),
+    )
+    assert [f.reliability for f in found.figures] == [0.56, 0.40]
+    assert [f.worst for f in found.figures] == ["hard", "hard"]
+    assert [f.j for f in found.figures] == pytest.approx([1.44, 1.60])
+    assert found.best == "good"
+    assert found.of("good").lower < 0.56 < found.of("good").upper < 0.75
+
+
+def test_actions_are_compared_where_all_of_them_were_run() -> None:
+    """One that was never run in the storm is not better for it; the runs there are known nevertheless."""
+    new = {"calm": shares(0.9, 50)}
+    found = compare({"act": HARD, "new": new, "unknown": {}}, Question())
+    assert found.scenarios == ("calm",)
+    assert (found.of("act").reliability, found.of("act").runs) == (0.99, 300)
+    assert found.best == "act"
+    apart = compare({"act": HARD, "other": {"fog": shares(0.9, 50)}}, Question())
+    assert apart.scenarios == ()
+    assert apart.of("act").worst == "storm"
+    assert isnan(found.of("unknown").j)
+
+
+def test_while_nobody_meets_the_target_nobody_is_ruled_out() -> None:
+    """As a selector does: the lowest J of all, and it is said that the target is not met."""
+    actions = {"weak": {"": runs(50, 50, 1.0)}, "weaker": {"": runs(20, 80, 1.0)}}
+    found = compare(actions, Question(target=0.9))
+    assert found.unmet
+    assert found.best == "weak"
+    assert [f.j for f in found.figures] == pytest.approx([f.j for f in compare(actions, Question()).figures])
+    assert not any(f.admissible or f.scenarios for f in found.figures)
+    assert not compare({"new": {}}, Question(target=0.9)).unmet
+
+
+def test_a_cost_that_nobody_reported_is_named() -> None:
+    """It counts as 0 in J, which no figure shows."""
+    found = judged(Question("value:images"), one=runs(9, 1), new=Tally())
+    assert found.uncosted == ("one",)
+    assert found.rho == 0.0
+    assert judged(one=runs(9, 1)).uncosted == ()
+
+
+def test_a_node_that_is_away_is_away_in_all_scenarios() -> None:
+    """A is over all of them, though the starts that never began were in one without a single run."""
+    found = compare({"act": {"calm": runs(9, 1), "storm": runs(0, 0, missing=10)}}, Question())
+    assert found.of("act").availability == 0.5
+    assert found.scenarios == ("calm",)

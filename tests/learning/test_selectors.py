@@ -218,6 +218,100 @@ def test_a_deferred_verdict_changes_the_sums() -> None:
     assert selector.objective("")["b"] == pytest.approx(before + 0.1)
 
 
+def test_a_late_verdict_changes_no_more_than_is_left_of_its_run() -> None:
+    """After 300 trials of b the sums hold 0.37 of the only run of a: corrected it is all of them, and R is 1, not 2.7."""
+    selector = make("tracking", ("a", "b"))
+    selector.update("", "a", failure())
+    for _ in range(300):
+        selector.update("", "b", success(0.5))
+    batch = selector.learner("")
+    left = batch.runs[0, 0]
+    assert left == pytest.approx((1 - 1 / 300) ** 300)
+    selector.correct("", "a", Status.FAILURE, Status.SUCCESS, 300)
+    assert batch.successes[0, 0] == pytest.approx(left)
+    assert batch.reliability()[0, 0] == pytest.approx(1.0)
+    assert selector.objective("")["a"] == pytest.approx(1.0)
+    assert min(selector.objective(""), key=selector.objective("").__getitem__) == "b"
+
+
+@pytest.mark.parametrize("age", [0, 1, 40])
+def test_a_verdict_fades_with_its_run(age: int) -> None:
+    """The sums come out as if the run had ended so from the beginning."""
+
+    def learned(first: Observation) -> RuleSelector:
+        selector = make("tracking", ("a", "b"))
+        for outcome in (success(), success(), first):
+            selector.update("", "a", outcome)
+        for i in range(age):
+            selector.update("", "ab"[i % 2], failure())
+        return selector
+
+    corrected = learned(failure())
+    corrected.correct("", "a", Status.FAILURE, Status.SUCCESS, age)
+    for name in ("runs", "successes"):
+        assert getattr(corrected.learner(""), name) == pytest.approx(getattr(learned(success()).learner(""), name))
+    own, expected = corrected.learner("").own, learned(success()).learner("").own
+    assert own["seen_success"] == pytest.approx(expected["seen_success"])
+
+
+def test_a_verdict_on_a_run_before_a_restart_changes_nothing() -> None:
+    """The run that raised the alarm was forgotten with the others; the first one after it is corrected."""
+    selector = make("tracking", ("a", "b"))
+    trials = 0
+    while not selector.learner("").own["restarts"][0, 0]:
+        trials += 1
+        selector.update("", "a", success() if trials < 100 else failure())
+    for after in range(3):
+        before = selector.state()
+        for age in range(after, trials + after):
+            selector.correct("", "a", Status.FAILURE, Status.SUCCESS, age)
+        assert selector.state() == before
+        selector.update("", "a", failure())
+    selector.correct("", "a", Status.FAILURE, Status.SUCCESS, 2)
+    assert selector.learner("").successes[0, 0] == pytest.approx((1 - 1 / 300) ** 2)
+
+
+STEPS = st.lists(
+    st.tuples(st.sampled_from("usmcr"), st.sampled_from(ACTIONS), st.integers(0, 60), st.integers(1, 60)), max_size=25
+)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.sampled_from(NAMES), STEPS, st.sampled_from([None, 0.5, 0.9]))
+def test_shares_stay_shares_whatever_is_corrected(
+    name: str, steps: list[tuple[str, str, int, int]], target: float | None
+) -> None:
+    """Trials, runs that never began, verdicts of any age, restarts by what is kept: R, A and J stay what they are."""
+    selector = make(name, ACTIONS, Question("wall", target))
+    for what, action, age, times in steps:
+        for _ in range(times):
+            if what == "c":
+                selector.correct("", action, Status.FAILURE, Status.SUCCESS, age)
+            elif what == "r":
+                selector.correct("", action, Status.SUCCESS, Status.ERROR, age)
+            else:
+                outcome = {"u": failure(0.1 * times), "s": success(2.0), "m": missing()}[what]
+                selector.update("", action, outcome)
+        again = make(name, ACTIONS, Question("wall", target))
+        again.restore(json.loads(json.dumps(selector.state())))
+        selector = again
+        batch = selector.learner("")
+        assert np.all((batch.reliability() >= 0) & (batch.reliability() <= 1))
+        assert np.all((batch.availability() >= 0) & (batch.availability() <= 1))
+        assert np.all(batch.objective() >= 0)
+        assert np.all((batch.p >= 0) & (batch.p <= 1))
+        assert np.all(batch.successes <= batch.runs)
+
+
+def test_a_state_with_more_successes_than_runs_is_mended() -> None:
+    """As states could be that were written before corrections were bounded."""
+    selector = taught(make("tracking", ACTIONS), good=3)
+    state = selector.state()
+    state["learners"][""]["successes"][0] = 1e3
+    selector.restore(state)
+    assert selector.learner("").reliability().max() == 1.0
+
+
 def test_only_actions_that_meet_the_target_are_sought() -> None:
     """Cheap but unreliable wins without a target, and is left with one; while nobody meets it, J alone decides."""
     trials = [("cheap", [success(0.1)] * 6 + [failure(0.1)] * 4), ("sure", [success(5.0)] * 10)]
