@@ -15,7 +15,11 @@ from coordinator.forecast.shares import holm
 LEVEL = 0.01
 """Level at which played and measured throws differ, over all tests of a regime (Holm)."""
 NEGLIGIBLE = 0.02
-"""Share of throws that may rest on a guess: below it, no forecast share is moved by more than the margin of equivalence."""
+"""Share of throws that may rest on a guess, or by which a share of played throws may miss the measured one: what is less moves no
+forecast share by more than the margin of equivalence."""
+TIME, MEAN = "time", "mean time"
+OFF_TIME = 0.05
+"""The same of mean times (relative) and of shares of throws in classes of the time."""
 
 
 def measured(training: Training) -> Played:
@@ -30,23 +34,24 @@ def measured(training: Training) -> Played:
 
 
 def residuals(training: Training, played: Played) -> list[dict[str, Any]]:
-    """Chi-square tests that measured and played throws come from one law, with p and Holm's p.
+    """Chi-square tests that measured and played throws come from one law, with p, Holm's p and how far off they are.
 
-    Goals, completion, all-SUCCESS, classes of the time, its mean, and for each place by which transitions its runs left it.
+    Goals, completion, all-SUCCESS, classes of the time, its mean, and for each place by which transitions its runs left it. `off`
+    is the largest difference of two shares; of the mean time the relative one.
     """
     real = measured(training)
     tables = {
         "goal": _shares(real.goals > 0, played.goals > 0),
         "complete": _shares(real.completed, played.completed),
         "every run SUCCESS": _shares(real.all_success, played.all_success),
-        "time": _shares(_classes(real.time, real.time), _classes(played.time, real.time)),
+        TIME: _shares(_classes(real.time, real.time), _classes(played.time, real.time)),
     }
     for place, ways in routing(training).items():
         tables[f"ways out of {place}"] = ways_table(ways, played.ways.get(place, {}))
-    alone = {name: _p_value(table) for name, table in tables.items()}
-    alone["mean time"] = _same_mean(real.time, played.time)
+    alone = {name: _p_value(table) for name, table in tables.items()} | {MEAN: _same_mean(real.time, played.time)}
+    off = {name: _off(table) for name, table in tables.items()} | {MEAN: _mean_off(real.time, played.time)}
     return [
-        {"of": name, "p": p, "p_holm": together}
+        {"of": name, "p": p, "p_holm": together, "off": round(off[name], 6)}
         for (name, p), together in zip(alone.items(), holm(list(alone.values())), strict=True)
     ]
 
@@ -63,6 +68,19 @@ def _same_mean(one: Values, other: Values) -> float:
     if min(len(kept_one), len(kept_other)) < 2 or kept_one.std() + kept_other.std() == 0:
         return 1.0
     return float(ttest_ind(kept_one, kept_other, equal_var=False).pvalue)
+
+
+def _off(table: np.ndarray) -> float:
+    whole = table.sum(axis=1, keepdims=True)
+    if table.shape[1] == 0:
+        return 0.0
+    return float(np.abs(np.diff(table / whole, axis=0)).max()) if whole.min() > 0 else 1.0
+
+
+def _mean_off(one: Values, other: Values) -> float:
+    if np.isnan(one).all() or np.isnan(other).all() or np.nanmean(one) == 0:
+        return 0.0
+    return float(abs(np.nanmean(other) / np.nanmean(one) - 1.0))
 
 
 def _p_value(table: np.ndarray) -> float:
@@ -106,11 +124,15 @@ def ways_table(before: Mapping[str, int], after: Mapping[str, int]) -> np.ndarra
 
 
 def doubts(residual: Sequence[Mapping[str, Any]], played: Played, throws: int) -> list[str]:
-    """Why a forecast is doubtful, in words; nothing where it is not. `throws` were played for the forecast."""
+    """Why a forecast is doubtful, in words; nothing where it is not. `throws` were played for the forecast.
+
+    Played throws have to be off by more than chance and by more than matters: with many throws the first alone says little.
+    """
     out = [
-        f"throws played with the training's own choices differ from the training's: {row['of']} (p = {row['p_holm']:.1e})"
+        f"throws played with the training's own choices differ from the training's: {row['of']}, off by {row['off']:.1%} "
+        f"(p = {row['p_holm']:.1e})"
         for row in residual
-        if row["p_holm"] < LEVEL
+        if row["p_holm"] < LEVEL and row["off"] > (OFF_TIME if row["of"] in (TIME, MEAN) else NEGLIGIBLE)
     ]
     for place, n in sorted(played.beyond.items()):
         if n > NEGLIGIBLE * throws:
