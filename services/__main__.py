@@ -11,10 +11,10 @@ from pathlib import Path
 
 from services.comm.directory import Directory, DirectoryError, parse, read_text, verify_imports
 from services.comm.directory_file import nearest
-from services.comm.durations import not_negative
 from services.comm.lockstep import CellError
 from services.comm.lockstep_process import run_member
 from services.comm.parentage import die_with, wanted_with_parent
+from services.comm.quantities import number
 from services.comm.security import KeyFileError, KeyNeededError
 from services.lockstep_node import LockstepNode
 from services.scripted import ScriptError
@@ -37,7 +37,7 @@ def parser() -> argparse.ArgumentParser:
     commands.add_argument("--lockstep", action="store_true", help="be a member of a lock-step cell")
     commands.add_argument(
         "--await-coordinator",
-        type=not_negative,
+        type=number(least=0.0),
         default=0.0,
         metavar="S",
         help="lock step: wait so long for a coordinator that died and is resumed (s of wall time)",

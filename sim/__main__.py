@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from services.comm.directory import Directory, DirectoryError, load, resolve
-from services.comm.durations import not_negative
 from services.comm.lockstep import CellError
 from services.comm.lockstep_process import run_member
+from services.comm.quantities import number
 from services.comm.security import KeyFileError, KeyNeededError
 from sim.realtime import serve
 from sim.truth import LaboratoryError
@@ -31,7 +31,7 @@ def parser() -> argparse.ArgumentParser:
     commands.add_argument("--lockstep", action="store_true", help="be a member of a lock-step cell")
     commands.add_argument(
         "--await-coordinator",
-        type=not_negative,
+        type=number(least=0.0),
         default=0.0,
         metavar="S",
         help="lock step: wait so long for a coordinator that died and is resumed (s of wall time)",

@@ -25,13 +25,13 @@ from coordinator.campaign.plan import (
     identity,
     read_manifest,
     write_manifest,
-    write_whole,
 )
 from coordinator.campaign.policies import Policy, policy_of
 from coordinator.campaign.rows import Row, rows_of
 from coordinator.campaign.spent import note_block, note_sessions, sessions
 from coordinator.campaign.summary import Summary, result_of
 from coordinator.campaign.table import Table
+from services.comm.whole_file import write_whole
 
 AHEAD = 3
 """Blocks handed out beyond those that the workers are busy with, so that none waits while a slow one is awaited."""

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
+
+from services.comm.whole_file import write_whole
 
 SEEDS = 1_000_000
 """Mission seeds of one campaign seed."""
@@ -120,21 +121,6 @@ def digest(path: Path | str) -> str:
         return hashlib.sha256(Path(path).read_bytes()).hexdigest()
     except OSError as fault:
         raise CampaignError(f"{path}: {fault.strerror or fault}") from fault
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a file so that a kill or a power cut leaves the old one or the new one, never a part."""
-    draft = path.with_name(f"{path.name}.new")
-    with draft.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    draft.replace(path)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)  # the new name is on the disk before anything relies on it
-    finally:
-        os.close(folder)
 
 
 def write_manifest(folder: Path, plan: Plan) -> None:

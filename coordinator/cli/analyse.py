@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from coordinator.cli import CommandError
 from coordinator.cli.loading import task_path, write_json
-from coordinator.cli.quantities import number, whole
+from services.comm.quantities import number, whole
 
 if TYPE_CHECKING:
     from coordinator.analysis.commands import Outcome

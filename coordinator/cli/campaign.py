@@ -19,7 +19,7 @@ from coordinator.cli.loading import (
     task_path,
     write_json,
 )
-from coordinator.cli.quantities import number, probability, whole
+from services.comm.quantities import number, probability, whole
 
 if TYPE_CHECKING:
     from coordinator.campaign.conduct import Campaign

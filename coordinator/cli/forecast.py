@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
 from coordinator.cli.loading import load_directory, load_task, write_json
-from coordinator.cli.quantities import whole
+from services.comm.quantities import whole
 
 if TYPE_CHECKING:
     from coordinator.campaign.plan import Plan

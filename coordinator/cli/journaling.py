@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from coordinator.cli.quantities import whole
+from services.comm.quantities import whole
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

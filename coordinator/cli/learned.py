@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from coordinator.cli import CommandError
 from coordinator.cli.judged import refuse_unknown_context, show
 from coordinator.cli.propagated import show_task
-from coordinator.cli.quantities import number, probability
+from services.comm.quantities import number, probability
 
 if TYPE_CHECKING:
     from coordinator.experience.estimates_file import EstimatesFile, Kept

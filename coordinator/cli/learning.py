@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
-from coordinator.cli.quantities import probability
+from services.comm.quantities import probability
 
 if TYPE_CHECKING:
     from coordinator.experience.learning_session import LearningSession

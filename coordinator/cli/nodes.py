@@ -9,8 +9,8 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from coordinator.cli.loading import add_services_argument, load_directory, write_json
-from services.comm.durations import positive
 from services.comm.expiry import SOON
+from services.comm.quantities import number
 
 if TYPE_CHECKING:
     from services.comm.directory import Directory
@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     add_services_argument(parser)
     parser.add_argument(
-        "--timeout", type=positive, default=2.0, metavar="S", help="seconds to wait (default: %(default)s)"
+        "--timeout", type=number(above=0.0), default=2.0, metavar="S", help="seconds to wait (default: %(default)s)"
     )
     parser.add_argument("--json", metavar="FILE", help="write the answers as JSON (- for standard output)")
 

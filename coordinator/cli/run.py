@@ -27,7 +27,7 @@ from coordinator.cli.loading import (
 from coordinator.cli.lockstep import substitutes
 from coordinator.cli.page_port import add_page_port_argument, named_port
 from coordinator.cli.parameters import pairs, parameter_of
-from coordinator.cli.quantities import whole
+from services.comm.quantities import whole
 
 if TYPE_CHECKING:
     from coordinator.launch import Setting

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from coordinator.cli.loading import task_path
-from coordinator.cli.quantities import number, whole
+from services.comm.quantities import number, whole
 
 EXAMPLE = "petrobot simulate catch_ball --replicas 2000 --seed 1"
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from coordinator.cli import CommandError
 from coordinator.cli.loading import add_services_argument, load_directory, refuse_misplaced
 from coordinator.cli.lockstep import substitutes
-from services.comm.durations import not_negative
+from services.comm.quantities import number
 
 if TYPE_CHECKING:
     from services.comm.directory import Directory
@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--await-coordinator",
-        type=not_negative,
+        type=number(least=0.0),
         default=600.0,
         metavar="S",
         help="lock step: how long a coordinator that died is waited for (%(default)g s of wall time)",
@@ -58,8 +58,8 @@ async def _up(directory: Directory, options: argparse.Namespace) -> int:
     if not programs:
         raise CommandError(2, f"{directory.source}: none of its nodes has an address of this host")
     stop = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    for each in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(each, stop.set)
     respawn = not (options.no_respawn or options.lockstep)  # a member that died has left its cell for good
     supervisor = Supervisor(programs, options.logs, respawn=respawn, notice=print)
     try:

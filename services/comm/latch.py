@@ -10,12 +10,13 @@ of the user's own (`$XDG_STATE_HOME` or `~/.local/state`). What lies in any of t
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
+
+from services.comm.whole_file import write_whole
 
 ALL: Final = "*"
 STATE: Final = "PETROBOT_STATE"
@@ -92,24 +93,8 @@ def _read(path: Path) -> frozenset[str]:
 
 
 def _write(path: Path, names: list[str]) -> None:
-    """In one piece and synced: a power cut leaves the old file or the new one."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_suffix(f".{os.getpid()}")
-    try:
-        with draft.open("w", encoding="utf-8") as file:
-            file.write("\n".join(names) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        draft.replace(path)
-    except OSError:
-        with contextlib.suppress(OSError):
-            draft.unlink(missing_ok=True)
-        raise
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    write_whole(path, "\n".join(names) + "\n")
 
 
 def _writable(folder: Path) -> bool:

@@ -71,11 +71,14 @@ def test_overview_and_unknown_command(capsys: pytest.CaptureFixture[str]) -> Non
         (["run", "catch_ball", "--keep", "0"], "--keep: 0 is not a whole number of at least 1"),
         (["run", "catch_ball", "--target", "0"], "--target: 0 is not a number of more than 0 and at most 1"),
         (["forecast", "catch_ball", "--replicates", "5"], "--replicates: 5 is not a whole number of at least 20"),
-        (["nodes", "--timeout", "-1"], "--timeout: -1: give seconds"),
-        (["nodes", "--timeout", "0"], "--timeout: 0: give seconds, more than 0"),
-        (["nodes", "--timeout", "inf"], "--timeout: inf: give seconds"),
-        (["up", "--lockstep", "--await-coordinator", "-1"], "--await-coordinator: -1: give seconds"),
-        (["up", "--lockstep", "--await-coordinator", "soon"], "--await-coordinator: soon: give seconds"),
+        (["nodes", "--timeout", "-1"], "--timeout: -1 is not a number of more than 0"),
+        (["nodes", "--timeout", "0"], "--timeout: 0 is not a number of more than 0"),
+        (["nodes", "--timeout", "inf"], "--timeout: inf is not a number of more than 0"),
+        (["up", "--lockstep", "--await-coordinator", "-1"], "--await-coordinator: -1 is not a number of at least 0"),
+        (
+            ["up", "--lockstep", "--await-coordinator", "soon"],
+            "--await-coordinator: soon is not a number of at least 0",
+        ),
     ],
 )
 def test_bad_input_is_exit_code_2_and_names_the_fault(
