@@ -1,0 +1,79 @@
+"""What users have on disk still reads: files written by the program as it was at commit 1eefa30.
+
+The files lie in `written_at_1eefa30/`. They were made by the commands of their names: `run` in lock
+step with learning (`lockstep`, `lab.estimates`), in real time (`realtime`), of the rover (`rover`), and
+of six balls (`killed`: its journal is cut off in the middle, its result is that of the whole run);
+`campaign` of 60 trials, and `forecast --out` from
+it, and a campaign of another seed to compare them with (`later`). They are never made again.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from coordinator.cli import main
+
+FILES = Path(__file__).parent / "written_at_1eefa30"
+
+
+def given(path: Path) -> Any:
+    """The JSON in a file."""
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("name", ["lockstep", "realtime", "rover", "killed"])
+def test_a_journal_replays_without_a_difference(name: str, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", str(FILES / "runs" / name)]) == 0
+    assert "all derived again as they were" in capfd.readouterr().out
+
+
+def test_a_killed_run_resumes_to_the_end_that_it_had_without_the_kill(tmp_path: Path) -> None:
+    folder = tmp_path / "killed"
+    folder.mkdir()
+    shutil.copy(FILES / "runs" / "killed" / "run.journal", folder)
+    assert main(["resume", str(folder), "--quiet", "--no-page", "--json", str(tmp_path / "end.json")]) == 0
+    end, whole = given(tmp_path / "end.json"), given(FILES / "runs" / "killed" / "result.json")
+    assert {key: end[key] for key in whole if key not in ("wall_s", "journal")} == {
+        key: value for key, value in whole.items() if key not in ("wall_s", "journal")
+    }
+
+
+def test_an_estimates_file_is_shown_and_learned_into(tmp_path: Path) -> None:
+    estimates = tmp_path / "lab.estimates"
+    shutil.copy(FILES / "lab.estimates", estimates)
+    assert main(["learned", "show", str(estimates), "--json", str(tmp_path / "before.json")]) == 0
+    more = ["run", "catch_ball", "--mode", "lockstep", "--runs", "1", "--quiet", "--seed", "6"]
+    assert main([*more, "--learn", str(estimates)]) == 0
+    assert main(["learned", "show", str(estimates), "--json", str(tmp_path / "after.json")]) == 0
+    before, after = given(tmp_path / "before.json"), given(tmp_path / "after.json")
+    assert _trials(before) == {"locate_ball": 3, "track_ball": 3, "move_to_point": 3}
+    assert _trials(after) == {name: count + 1 for name, count in _trials(before).items()}
+
+
+def _trials(shown: Any) -> dict[str, int]:
+    """How many runs of each primitive task with alternatives the estimates were made from."""
+    tasks = ("locate_ball", "track_ball", "move_to_point")
+    return {name: sum(a["runs"] for a in shown["primitive_tasks"][name]["actions"]) for name in tasks}
+
+
+def test_a_registered_forecast_is_compared_with_a_campaign_that_ran_later(tmp_path: Path) -> None:
+    later = tmp_path / "later"
+    shutil.copytree(FILES / "later", later)
+    compared = ["forecast", "--compare", str(FILES / "forecast.json"), str(later)]
+    assert main([*compared, "--json", str(tmp_path / "compared.json")]) == 0
+    rows = given(tmp_path / "compared.json")["rows"]
+    assert {row["runs"] for row in rows} == {60} and {row["regime"] for row in rows} == {"A"}
+
+
+def test_a_campaign_is_reported_on_beside_a_copy_of_itself(tmp_path: Path) -> None:
+    same = tmp_path / "same"
+    shutil.copytree(FILES / "campaign", same)
+    against = ["report", str(FILES / "campaign"), "--against", str(same)]
+    numbers = str(tmp_path / "numbers.json")
+    assert main([*against, "--out", str(tmp_path / "page.html"), "--json", numbers]) == 0
+    assert given(tmp_path / "numbers.json")["pairs"] == 60
