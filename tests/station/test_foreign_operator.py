@@ -197,7 +197,7 @@ def test_a_foreign_operator_steers_a_catch_and_sees_what_the_coordinator_sees(op
     assert operator.order("take_controls")["ok"]
     assert operator.order("load", task="catch_ball")["ok"]
     assert operator.order("breakpoint", element="places.return_home", on=True)["ok"]
-    assert operator.order("start", task="catch_ball", mode="lockstep", runs=1, seed=9, pace=0)["ok"]
+    assert operator.order("start", task="catch_ball", mode="lockstep", runs=1, seed=9, pace=1)["ok"]
     operator.until(lambda state: state["paused"])
     assert operator.state["marking"]["return_home"] == 1
     assert operator.order("add_tokens", place="arm_free", count=1)["code"] == "refused"
