@@ -29,7 +29,7 @@ lint: $(VENV)/.ready
 	$(BIN)/mypy coordinator services sim tests
 
 test: lint
-	$(BIN)/pytest -n 2 -m "not proof"
+	$(BIN)/pytest -n 2 -rs -m "not proof"
 
 proof: $(VENV)/.ready
 	$(BIN)/python -m tests.proof

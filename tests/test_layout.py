@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -178,3 +179,98 @@ def test_general_rooms_name_no_robot(name: str) -> None:
             for part in text.lower().split("_")
         }
         assert not words & (ROBOT_WORDS - ({"camera"} if module == "services.comm.camera" else set())), module
+
+
+OWNED_LOOP = re.compile(r"not self\._over(\(\w+\)|\.is_set\(\))?")
+"""The loop of a helper's thread or task, which its owner ends: `while not self._over.is_set()`."""
+CLOCKS = {"monotonic", "time", "now"}
+TESTS = [
+    path
+    for path in sorted((ROOT / "tests").rglob("*.py"))
+    # benches run by hand, and the cell of an outside user has the deadlines of its own
+    if not {"bench", "outside"} & set(path.relative_to(ROOT).parts)
+]
+
+
+def own_nodes(node: ast.AST) -> Iterator[ast.AST]:
+    """What a statement holds, except what lies in functions that it defines."""
+    for child in ast.iter_child_nodes(node):
+        if not isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda | ast.ClassDef):
+            yield child
+            yield from own_nodes(child)
+
+
+def has_limit(loop: ast.While, timed: bool) -> bool:
+    """Whether this loop cannot wait for ever: the rule of `test_no_wait_is_without_a_limit`."""
+    inside = list(own_nodes(loop))
+    names = {ast.unparse(n) for n in ast.walk(loop.test)}
+    counted = {
+        ast.unparse(n.target) for n in inside if isinstance(n, ast.AugAssign) and isinstance(n.value, ast.Constant)
+    }
+    called = {
+        n.func.attr: ast.unparse(n.func.value)
+        for n in inside
+        if isinstance(n, ast.Call) and isinstance(n.func, ast.Attribute)
+    }
+    compared = {
+        name
+        for n in inside
+        if isinstance(n, ast.Compare) and any(isinstance(op, ast.Lt | ast.LtE | ast.Gt | ast.GtE) for op in n.ops)
+        for part in ast.walk(n)
+        for name in (ast.unparse(part), getattr(part, "attr", ""))
+    }
+    never_left = isinstance(loop.test, ast.Constant) and not any(isinstance(n, ast.Return | ast.Break) for n in inside)
+    return (
+        never_left  # no wait: the test cancels or kills it
+        or (timed and any(isinstance(n, ast.Await) for n in inside))
+        or "left" in called  # tests.waiting.Limit
+        or bool(compared & (CLOCKS | counted))
+        or any(called.get(verb) in names for verb in ("pop", "popleft"))  # empties what it looks at
+        or any(isinstance(n, ast.NamedExpr) for n in ast.walk(loop.test))  # reads its source to the end
+        or OWNED_LOOP.fullmatch(ast.unparse(loop.test)) is not None
+    )
+
+
+def loops(node: ast.AST, timed: bool = False) -> Iterator[tuple[ast.While, bool]]:
+    """Every `while` of a module, and whether it lies in an `asyncio.timeout` of its own function."""
+    for child in ast.iter_child_nodes(node):
+        inner = timed and not isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef)
+        if isinstance(child, ast.AsyncWith):
+            inner = inner or any("timeout" in ast.unparse(item.context_expr) for item in child.items)
+        if isinstance(child, ast.While):
+            yield child, inner
+        yield from loops(child, inner)
+
+
+def test_no_wait_is_without_a_limit() -> None:
+    """Every `while` of the tests has a limit: of time, of steps, or the end of what it reads.
+
+    A test that waits for ever cannot fail, so it shows nothing. Remedy: `tests.waiting.Limit`.
+    """
+    unlimited = [
+        f"{path.relative_to(ROOT)}:{loop.lineno}: while {ast.unparse(loop.test)}"
+        for path in TESTS
+        for loop, timed in loops(ast.parse(path.read_text(encoding="utf-8")))
+        if not has_limit(loop, timed)
+    ]
+    assert not unlimited, "\n".join(["no limit (use tests.waiting.Limit):", *unlimited])
+
+
+@pytest.mark.parametrize(
+    ("source", "limited"),
+    [
+        ("while not ready(): step()", False),
+        ("while True:\n if ready(): break", False),
+        ("while len(got) < 3: got += read()", False),
+        ("while not ready() and limit.left(): step()", True),
+        ("while not ready():\n assert time.monotonic() < end", True),
+        ("while tries < 5: tries += 1", True),
+        ("while queue: visit(queue.popleft())", True),
+        ("while data := read(): keep(data)", True),
+        ("while True: serve()", True),
+    ],
+)
+def test_the_rule_of_limits_tells_waits_apart(source: str, limited: bool) -> None:
+    """What the rule above refuses and what it lets pass."""
+    (loop,) = ast.parse(source).body
+    assert isinstance(loop, ast.While) and has_limit(loop, timed=False) is limited

@@ -1,20 +1,23 @@
 """Pictures of a report as PNG, for papers and mails that take no SVG: rendered by resvg, twice the size of the SVG.
 
-resvg is one wheel that needs nothing of the system but its fonts; a browser or Cairo would have to be installed apart, and OpenCV
-draws no SVG.
+resvg is one wheel that needs nothing of the system; a browser or Cairo would have to be installed apart, and OpenCV draws no SVG.
+The words are drawn with the font that is shipped beside this file, and with no other, so a picture looks the same on every host.
 """
 
 from __future__ import annotations
 
 from functools import cache
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 SCALE = 2.0
 """Pixels of the PNG for one of the SVG: sharp on dense screens and in print."""
 PAPER = "#ffffff"
 REMEDY = 'pip install "resvg-py>=0.5,<1"'
-_PROBE = '<svg xmlns="http://www.w3.org/2000/svg" width="40" height="20"><text y="15" font-family="sans-serif">{}</text></svg>'
+FONT = Path(__file__).parent / "fonts" / "DejaVuSans.ttf"
+"""DejaVu Sans 2.35 as its authors published it, with its licence beside it."""
+FAMILY = "DejaVu Sans"
 
 
 class RasterError(Exception):
@@ -28,7 +31,17 @@ def png(svg: str, scale: float = SCALE) -> bytes:
         raise RasterError(missing)
     try:
         return bytes(
-            _resvg().svg_to_bytes(svg_string=svg, background=PAPER, zoom=scale, sans_serif_family="DejaVu Sans")
+            _resvg().svg_to_bytes(
+                svg_string=svg,
+                background=PAPER,
+                zoom=scale,
+                skip_system_fonts=True,
+                font_files=[str(FONT)],
+                font_family=FAMILY,
+                sans_serif_family=FAMILY,
+                serif_family=FAMILY,
+                monospace_family=FAMILY,
+            )
         )
     except ValueError as fault:
         raise RasterError(f"the picture is no SVG that can be rendered: {fault}") from fault
@@ -36,13 +49,13 @@ def png(svg: str, scale: float = SCALE) -> bytes:
 
 @cache
 def unavailable() -> str:
-    """Why no PNG can be made on this host, with the remedy; empty when it can."""
+    """Why no PNG can be made by this installation, with the remedy; empty when it can."""
     try:
-        drawn, blank = (_resvg().svg_to_bytes(svg_string=_PROBE.format(text)) for text in ("petrobot", ""))
+        _resvg()
     except ImportError:
         return f"resvg is not installed: {REMEDY}"
-    if drawn == blank:
-        return "this host has no fonts, so pictures would have no words: install one (Debian: fonts-dejavu-core)"
+    if not FONT.is_file():
+        return f"{FONT}: the font of the pictures is missing; install petrobot again"
     return ""
 
 

@@ -18,6 +18,7 @@ from coordinator.analysis.netfile import NetFile
 from coordinator.analysis.pnml_writing import write_pnml
 from coordinator.net import Net
 from tests.analysis.generators import kanban, philosophers
+from tests.waiting import Limit
 
 ROOM = 3 << 30
 """Bytes of address space that a command gets; libraries alone map about one gigabyte."""
@@ -110,7 +111,8 @@ def test_ctrl_c_ends_a_simulation_with_its_intervals(tmp_path: Path) -> None:
 def _interrupt_after(process: subprocess.Popen[str], seconds: float) -> None:
     """Ctrl-C once the process has taken that much processor time."""
     ticks, statistics = os.sysconf("SC_CLK_TCK"), Path(f"/proc/{process.pid}/stat")
-    while process.poll() is None:
+    limit = Limit(f"{seconds} s of processor time")
+    while process.poll() is None and limit.left():
         fields = statistics.read_text().rpartition(")")[2].split()
         if (int(fields[11]) + int(fields[12])) / ticks >= seconds:
             process.send_signal(signal.SIGINT)

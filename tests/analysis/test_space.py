@@ -19,6 +19,7 @@ from coordinator.net import Net
 from services.comm.compiled import COMPILED
 from tests.analysis.generators import fms, kanban, philosophers
 from tests.analysis.random_nets import brute_force, nets
+from tests.waiting import Limit
 
 ENGINES: dict[str, Callable[[Explored], Engine]] = {
     "integers": IntegerEngine,
@@ -30,7 +31,8 @@ ENGINES: dict[str, Callable[[Explored], Engine]] = {
 def run(kind: str, net: Net, *, least: int = 1, cap: int | None = None, keep: bool = True) -> Explored:
     """A whole search by one engine, from the narrowest layout unless said otherwise."""
     engine = ENGINES[kind](Explored.start(net, Layout.for_net(net, least=least), keep))
-    while engine.expand(cap) and (cap is None or engine.states < cap):
+    limit = Limit("the end of the search")
+    while (engine.expand(cap) and (cap is None or engine.states < cap)) and limit.left():
         pass
     return engine.explored()
 
@@ -78,7 +80,8 @@ def test_one_engine_goes_on_where_another_stopped(net: Net, cap: int, first: str
     expected = brute_force(net, 200)
     assume(expected is not None)
     engine = ENGINES[second](run(first, net, cap=cap))
-    while engine.expand(None):
+    limit = Limit("the end of the search")
+    while engine.expand(None) and limit.left():
         pass
     assert listed(engine.explored()) == expected
 

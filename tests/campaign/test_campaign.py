@@ -28,7 +28,7 @@ from coordinator.experience.estimates_file import EstimatesFile
 from coordinator.launch import Setting, lockstep_cell
 from coordinator.learning.objective import Question, compare
 from tests.campaign.conftest import SERVICES, TASK, Conduct
-from tests.waiting import beat
+from tests.waiting import until
 
 
 def table(folder: Path) -> bytes:
@@ -215,8 +215,7 @@ def test_workers_in_any_number_and_a_killed_one_change_nothing(
         async with LocalPool(plan, count, campaign.folder / "workers.log") as pool:
             going = asyncio.create_task(campaign.run(pool))
             if kill:
-                while not pool.pids:
-                    await beat(0)
+                await until(lambda: pool.pids, "a worker of the pool")
                 os.kill(pool.pids[0], signal.SIGKILL)
             await going
             return pool

@@ -24,6 +24,7 @@ from coordinator.campaign.spent import times
 from coordinator.cli import main
 from coordinator.cli.campaign import text_of
 from tests.campaign.conftest import HERE, SERVICES, TASK
+from tests.waiting import Limit
 
 ROOT = HERE.parents[1]
 TOY = [str(TASK), "--services", str(SERVICES)]
@@ -136,8 +137,7 @@ def test_a_killed_campaign_goes_on(tmp_path: Path) -> None:
 
     part = start(*arguments, "--out", "part")
     table = tmp_path / "part" / "table.csv"
-    while not table.exists() and part.poll() is None:
-        select.select([], [], [], 0.01)
+    _until(lambda: table.exists() or part.poll() is not None)
     part.kill()
     part.wait()
     assert 0 < table.read_bytes().count(b"\n") < 61
@@ -296,7 +296,8 @@ def test_progress_is_for_terminals(capsys: pytest.CaptureFixture[str]) -> None:
             shown(Progress(done, 2, 0, 1, float(done)))
         shown.close()
         told = b""
-        while not told.endswith(b"\n"):
+        limit = Limit("the end of the line")
+        while not told.endswith(b"\n") and limit.left():
             told += os.read(ours, 1000)
     os.close(ours)
     assert told.count(b"\r[") == 2 and told.count(b"\n") == 1

@@ -13,6 +13,7 @@ from services.comm.codec import LIMITS
 from services.comm.link import Limits
 from services.comm.messages import Executed, Hello, Message, Tick, Welcome
 from services.comm.wire import Connection, Side
+from tests.waiting import Limit
 
 from .ends import Node
 
@@ -78,7 +79,8 @@ def greet(client: Connection, server: Connection) -> bytes:
     """Lead both to open; gives all that the client sent."""
     said = client.send(Hello(1, 1, "coordinator", "coord", "b0", 1))
     hello = server.receive_data(said)
-    while not hello:
+    limit = Limit("the client's hello", steps=10)
+    while not hello and limit.left():
         assert client.receive_data(server.data_to_send()) == []
         proof = client.data_to_send()
         said += proof

@@ -62,18 +62,20 @@ class Cable:
 
     def _carry(self) -> None:
         pairs: dict[socket.socket, socket.socket] = {}
-        while True:
-            waiting = [self._stop] if self._cut else [self._stop, self._listener, *pairs]
-            ready, _, _ = select.select(waiting, [], [])
-            if self._stop in ready and not self._stop.recv(16):
-                break
+        ready: list[socket.socket] = []
+        while not self._over(ready):
             for one in [] if self._cut else [one for one in ready if one is not self._stop]:
                 if one is self._listener:
                     self._join(pairs)
                 elif one in pairs:
                     self._pass_on(one, pairs)
+            waiting = [self._stop] if self._cut else [self._stop, self._listener, *pairs]
+            ready, _, _ = select.select(waiting, [], [])
         for one in (*pairs, self._listener, self._stop):
             one.close()
+
+    def _over(self, ready: list[socket.socket]) -> bool:
+        return self._stop in ready and not self._stop.recv(16)
 
     def _join(self, pairs: dict[socket.socket, socket.socket]) -> None:
         near, _ = self._listener.accept()

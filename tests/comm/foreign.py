@@ -14,6 +14,8 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from tests.waiting import Limit
+
 HELLO, WELCOME, REFUSE, CALL, ACCEPT, FEEDBACK, RESULT, RESULT_ACK, CANCEL, EVENT, EVENT_ACK, SUBSCRIBE = range(1, 13)
 COMMAND, ANSWER, PING, PONG, TICK, BYE, CHALLENGE, PROOF, STREAM_OPEN, SET_POINT, WITHDRAW = range(13, 24)
 LIMIT = 60.0
@@ -127,8 +129,8 @@ class Foreign:
         self.socket.sendall(data)
 
     def _exactly(self, size: int) -> bytes:
-        data = b""
-        while len(data) < size:
+        data, limit = b"", Limit(f"{size} bytes of the node")
+        while len(data) < size and limit.left():
             more = self.socket.recv(size - len(data))
             if not more:
                 raise ConnectionError("the node hung up")

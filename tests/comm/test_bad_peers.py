@@ -14,6 +14,7 @@ from services.comm.caller import PeerLost
 from services.comm.codec import LIMITS
 from services.comm.link import Timing
 from services.comm.messages import Executed
+from tests.waiting import Limit
 
 from .ends import HELLO, Coordinator, Node, frame, read_all, until
 
@@ -117,7 +118,8 @@ async def _served_under_attack(frames: int) -> None:
     assert await coordinator.client.connected(60.0)
     attack = asyncio.gather(*(_attack(node.server.address, frames // 4, seed) for seed in range(4)))
     served = 0
-    while not attack.done():
+    limit = Limit("the end of the attack")
+    while not attack.done() and limit.left():
         assert (await coordinator.client.call("echo", {"n": served})).values == {"n": served}
         served += 1
     await attack

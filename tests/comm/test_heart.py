@@ -5,12 +5,14 @@ from __future__ import annotations
 import pytest
 
 from services.comm.link import Beat, Heart, Timing
+from tests.waiting import Limit
 
 
 def test_the_heart_pings_then_gives_up() -> None:
     heart = Heart(0.0, Timing())
     seen: list[tuple[float, Beat]] = []
-    while not seen or seen[-1][1] is not Beat.LOST:
+    limit = Limit("the loss of the peer", steps=10)
+    while (not seen or seen[-1][1] is not Beat.LOST) and limit.left():
         seen.append((heart.due(), heart.advance(heart.due())))
     assert seen == [(0.25, Beat.PING), (0.5, Beat.PING), (0.75, Beat.PING), (1.0, Beat.LOST)]
 

@@ -22,6 +22,7 @@ from services.comm.cell import Cell, CellError, Delays
 from services.comm.codec import encode
 from services.comm.lockstep import Member, PartyLostError
 from services.comm.party import TICK, Envelope, Party, Posted
+from tests.waiting import Limit
 
 from .toy_party import Toy
 
@@ -339,7 +340,8 @@ def test_a_member_that_does_not_keep_step_is_lost(rest: bytes | None, says: str)
             if rest is not None:
                 sock.sendall(rest)
                 sock.shutdown(socket.SHUT_WR)
-            while sock.recv(1 << 16):
+            limit = Limit("the other end to hang up")
+            while sock.recv(1 << 16) and limit.left():
                 pass
 
     def own() -> str:

@@ -21,6 +21,7 @@ import pytest
 from tests.comm import foreign as f
 from tests.comm.foreign import Foreign, pack
 from tests.integration.cell_files import ROOT, services_file
+from tests.waiting import Limit
 
 pytestmark = pytest.mark.processes
 GROWTH = 24 << 20
@@ -123,7 +124,8 @@ def attack(vision: Vision, connections: int) -> None:
             stranger.sendall(malformed(random_))
             if number % 20 == 0:
                 stranger.shutdown(socket.SHUT_WR)
-                while stranger.recv(4096):
+                limit = Limit("the node to hang up")
+                while stranger.recv(4096) and limit.left():
                     pass
         stranger.close()
         if time.monotonic() > asked + BEAT:
@@ -132,7 +134,8 @@ def attack(vision: Vision, connections: int) -> None:
     good.say(f.BYE)
     good.close()
     ask(after := vision.good("after"), 0)
-    while vision.sockets() > open_before:
+    limit = Limit("the sockets to be closed")
+    while vision.sockets() > open_before and limit.left():
         ask(after, 1)
     after.close()
     assert vision.process.poll() is None
@@ -201,8 +204,8 @@ def test_bodies_that_never_end_are_bounded(vision: Vision) -> None:
         one.raw((16 * MIB).to_bytes(4, "big") + b"\x94\x04\xa11\xa1s" + bytes(2 * MIB))
         open_.append(one)
         ask(good, number)
-    number = 0
-    while open_:  # they are silent: each is cut after 1 s
+    number, limit = 0, Limit("the silent ones to be cut")
+    while open_ and limit.left():  # they are silent: each is cut after 1 s
         number += 1
         ask(good, 100 + number)
         open_ = [one for one in open_ if not hung_up(one)]
@@ -212,7 +215,8 @@ def test_bodies_that_never_end_are_bounded(vision: Vision) -> None:
 def hung_up(one: Foreign) -> bool:
     """Whether the node has ended this connection; what it said on it is thrown away."""
     try:
-        while one.socket.recv(4096, socket.MSG_DONTWAIT):
+        limit = Limit("the end of what the node sent")
+        while one.socket.recv(4096, socket.MSG_DONTWAIT) and limit.left():
             pass
     except BlockingIOError:
         return False

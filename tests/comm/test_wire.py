@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from services.comm import messages as m
 from services.comm.codec import LIMITS, decode, encode
 from services.comm.wire import Connection, ProtocolError, Side, State, negotiate
+from tests.waiting import Limit
 
 from .conftest import KEY, KINDS, NONCES, greet, messages_of, new_pair
 
@@ -115,7 +116,8 @@ def test_byte_by_byte_handshake_and_call(key: bytes | None, pair: Pair) -> None:
     client, server = pair(key)
     towards_server, towards_client = client.send(HELLO), b""
     seen: list[m.Message] = []
-    while towards_server or towards_client:
+    limit = Limit("silence on the line", steps=20)
+    while (towards_server or towards_client) and limit.left():
         for byte in towards_server:
             for message in server.receive_data(bytes([byte])):
                 seen.append(message)

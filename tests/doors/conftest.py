@@ -23,7 +23,7 @@ from services.comm.client import Client
 from services.comm.codec import decode, encode
 from services.comm.credentials import Credentials
 from services.comm.wire import Connection, Side
-from tests.waiting import beat
+from tests.waiting import Limit, beat
 
 KEY = bytes(range(32))
 HELLO = m.Hello(1, 1, "coordinator", "coord", "c1", 3)
@@ -177,7 +177,8 @@ class Stranger:
         """Shake hands properly; gives the connection, to make sealed frames with."""
         connection = Connection(Side.CLIENT, key=key, nonce=os.urandom(32) if key else b"")
         await self.say(connection.send(hello))
-        while connection.version == 0:
+        limit = Limit("the handshake")
+        while connection.version == 0 and limit.left():
             body = await self._body()
             for message in connection.receive_data(len(body).to_bytes(4, "big") + body):
                 if isinstance(message, m.Refuse):

@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from services.comm import messages as m
 from services.comm.wire import Connection, ProtocolError, Side
 from tests.doors.conftest import HELLO, KEY, MIB, GoodClient, Stranger, Victim, frame
-from tests.waiting import beat
+from tests.waiting import Limit, beat
 
 pytestmark = pytest.mark.processes
 Start = Callable[..., Victim]
@@ -314,7 +314,8 @@ async def test_ten_thousand_connections(victim: Start, door: str, certificates: 
     async with server.good_client() as good, crowd_at(server, 10_000) as crowd:
         assert crowd.stdout is not None
         opened = asyncio.create_task(asyncio.to_thread(crowd.stdout.readline))
-        while not opened.done():
+        limit = Limit("the crowd to be there")
+        while not opened.done() and limit.left():
             await good.still_served(10)
             about = await asyncio.to_thread(server.about)
             assert about["opening"] <= 64 and about["fds"] < BOUNDED_FILES, about
@@ -366,7 +367,7 @@ async def test_a_flood_of_messages_is_held_back(victim: Start) -> None:
 
 async def _flood(stranger: Stranger, burst: bytes, times: int) -> None:
     async def swallow() -> None:
-        while await stranger.reader.read(1 << 16):
+        while _swallowed := await stranger.reader.read(1 << 16):
             pass
 
     swallowing = asyncio.create_task(swallow())
@@ -417,8 +418,8 @@ def random_bytes(chance: random.Random) -> bytes:
 
 
 async def _bombard(server: Victim, over: Callable[[int], bool], seed: int) -> int:
-    chance, sent = random.Random(seed), 0
-    while not over(sent):
+    chance, sent, limit = random.Random(seed), 0, Limit("the end of the bombardment", 300.0)
+    while not over(sent) and limit.left():
         with contextlib.suppress(ConnectionError):
             stranger = await Stranger.at(server)
             await stranger.say(random_bytes(chance))

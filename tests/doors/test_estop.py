@@ -25,7 +25,7 @@ from services.comm.canopen import NmtState
 from services.comm.cia402 import State
 from services.comm.directory import Directory
 from tests.doors.arm_cell import DRIVES, ROOT, Ear, cell_in, ear_on
-from tests.waiting import beat
+from tests.waiting import Limit, beat
 
 pytestmark = pytest.mark.processes
 LIMIT = 60.0
@@ -94,7 +94,9 @@ class Cell:
 
     async def standing(self) -> None:
         """Wait until the joints are where they were a ramp ago: whatever moved them is over."""
+        limit = Limit("joints that stand")
         while True:
+            limit.left()
             before = dict(self.ear.positions)
             await asyncio.to_thread(threading.Event().wait, RAMP / 4)
             if all(abs(self.ear.positions[n] - before[n]) < 200 for n in DRIVES):

@@ -25,7 +25,7 @@ from services.comm.directory import parse
 from services.comm.security import new_key, write_key
 from tests.doors.arm_cell import ROOT, cell_in
 from tests.doors.conftest import KEY, Victim
-from tests.waiting import beat
+from tests.waiting import Limit, beat
 
 pytestmark = pytest.mark.processes
 Start = Callable[..., Victim]
@@ -211,7 +211,8 @@ async def test_a_guarded_cell_works_and_keeps_its_secrets(tmp_path: Path, how: s
     token: dict[str, str] = {}
 
     async def look_for_token(done: asyncio.Future[Any]) -> None:
-        while not done.done() and not token:
+        limit = Limit("the page's token")
+        while not done.done() and not token and limit.left():
             for path in tmp_path.glob(f"runs/*/{DOOR}"):
                 token["page token"] = json.loads(path.read_text())["token"]
             await beat(0.01)

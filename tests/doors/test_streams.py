@@ -24,6 +24,7 @@ from services.comm.security import new_key, write_key
 from services.comm.stream import StreamReceiver, StreamSender
 from services.comm.stream_line import Incoming
 from tests.node.test_processes import CELL, Nodes, Operator
+from tests.waiting import Limit
 
 SHARED = '[keys]\nfile = "cell.key"\n'
 CERTIFICATES = '[keys]\ncertificates = "keys"\n'
@@ -111,7 +112,8 @@ def test_strangers_do_not_hold_up_the_loop_that_polls() -> None:
     sink = Taken()
     receiver = StreamReceiver("arm", {"points": Incoming(0.02, sink, "t.1")})
     good = StreamSender("vision", "points", 0.02, *receiver.address, ticket="t.1")
-    while not sink.values:
+    limit = Limit("the first value")
+    while not sink.values and limit.left():
         good.send([1.0])
         receiver.poll()
     crowd = [socket.create_connection(receiver.address) for _ in range(60)]
@@ -146,7 +148,8 @@ def test_a_crowd_at_the_camera_leaves_the_good_receiver_its_images() -> None:
     camera = ImageServer("127.0.0.1", 0)
     good = StreamImages("127.0.0.1", camera.port, time.monotonic)
     good.start(50.0)
-    while camera.rate < 50.0:
+    limit = Limit("the camera's rate")
+    while camera.rate < 50.0 and limit.left():
         good.newest()
         camera.poll()
     crowd = [socket.create_connection(("127.0.0.1", camera.port)) for _ in range(60)]
@@ -155,11 +158,12 @@ def test_a_crowd_at_the_camera_leaves_the_good_receiver_its_images() -> None:
         assert len(camera._receivers) <= 16
     pixels = np.zeros((4, 6), np.uint8)
     seen = None
-    while seen is None:
+    limit = Limit("an image")
+    while seen is None and limit.left():
         camera.send(pixels, 0.0)
         camera.poll()
         seen = good.newest()
-    assert seen.pixels.shape == (4, 6)
+    assert seen is not None and seen.pixels.shape == (4, 6)
     for one in crowd:
         one.close()
     good.close()
@@ -173,12 +177,14 @@ def test_a_crowd_at_the_simulated_bus_leaves_the_good_ports_their_frames() -> No
     hub.poll(1.0)
     address = ("127.0.0.1", int(hub.channel.rpartition(":")[2]))
     crowd = [socket.create_connection(address) for _ in range(100)]
-    while hub.ports < 64 or len(hub.dropped) < 20:
+    limit = Limit("64 ports and the refused rest")
+    while (hub.ports < 64 or len(hub.dropped) < 20) and limit.left():
         hub.poll(0.1)
     assert hub.ports == 64
     far.send(Frame(0x123, b"ab"))
     got: list[Frame] = []
-    while not got:
+    limit = Limit("the frame")
+    while not got and limit.left():
         hub.poll(0.1)
         got += near.receive()
     assert got == [Frame(0x123, b"ab")]

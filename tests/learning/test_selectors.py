@@ -16,6 +16,7 @@ from coordinator.learning.estimate import Observation, Tally
 from coordinator.learning.objective import Question
 from coordinator.learning.selectors import RULES, RuleSelector, make
 from coordinator.task import Executed, Status
+from tests.waiting import Limit
 
 ACTIONS = ("a", "b", "c", "d")
 NAMES = sorted(RULES)
@@ -257,8 +258,8 @@ def test_a_verdict_fades_with_its_run(age: int) -> None:
 def test_a_verdict_on_a_run_before_a_restart_changes_nothing() -> None:
     """The run that raised the alarm was forgotten with the others; the first one after it is corrected."""
     selector = make("tracking", ("a", "b"))
-    trials = 0
-    while not selector.learner("").own["restarts"][0, 0]:
+    trials, limit = 0, Limit("the alarm", steps=1000)
+    while not selector.learner("").own["restarts"][0, 0] and limit.left():
         trials += 1
         selector.update("", "a", success() if trials < 100 else failure())
     for after in range(3):

@@ -27,6 +27,7 @@ from services.comm.can_stream import (
     parse_channel,
 )
 from services.comm.canbus import CanBus, Frame
+from tests.waiting import Limit
 
 PATIENCE = 5.0
 
@@ -70,7 +71,8 @@ def pair(channel: str) -> Iterator[tuple[can.BusABC, can.BusABC]]:
     first, second = _open(channel), _open(channel)
     for sender, receiver in ((first, second), (second, first)):
         sender.send(can.Message(arbitration_id=0x7FF, is_extended_id=False))
-        while receiver.recv(timeout=0.05) is None:  # the hub had not taken the other one in yet
+        limit = Limit("the first message")
+        while receiver.recv(timeout=0.05) is None and limit.left():  # the hub had not taken the other one in yet
             sender.send(can.Message(arbitration_id=0x7FF, is_extended_id=False))
     _flush(first)
     _flush(second)
@@ -80,7 +82,8 @@ def pair(channel: str) -> Iterator[tuple[can.BusABC, can.BusABC]]:
 
 
 def _flush(bus: can.BusABC) -> None:
-    while bus.recv(timeout=0.02) is not None:
+    limit = Limit("an empty line")
+    while bus.recv(timeout=0.02) is not None and limit.left():
         pass
 
 
@@ -194,7 +197,8 @@ def test_a_hub_that_goes_is_noticed() -> None:
     running = RunningHub("tcp://127.0.0.1:0")
     bus, port = _open(running.channel), StreamPort(running.channel)
     bus.send(can.Message(arbitration_id=1, is_extended_id=False))
-    while not port.receive():
+    limit = Limit("the frame")
+    while not port.receive() and limit.left():
         pass
     running.close()
     with pytest.raises(can.CanOperationError, match="closed by its other end"):
@@ -257,7 +261,8 @@ def test_a_port_that_does_not_read_is_dropped_and_does_not_stop_the_bus() -> Non
         hub.poll()
         seen += len(reader.receive())
         assert sent < 2_000_000
-    while seen < sent:
+    limit = Limit("the frames that were sent")
+    while seen < sent and limit.left():
         hub.poll(0.01)
         seen += len(reader.receive())
     assert "does not read" in hub.dropped[0]

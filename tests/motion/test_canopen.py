@@ -12,6 +12,7 @@ from services.comm import canopen, cia402
 from services.comm.canbus import Frame
 from services.comm.canopen import Abort, Mapped, NmtCommand, NmtState, SdoAbortError, SdoClient, Transfer, Type
 from services.comm.cia402 import Command, State
+from tests.waiting import Limit
 
 WRITTEN_OUT = [
     (canopen.nmt(NmtCommand.START), 0x000, "01 00"),
@@ -195,10 +196,10 @@ def test_every_controlword_is_a_command_and_every_command_has_its_word() -> None
 
 def test_enabling_leads_from_every_resting_state_to_operation() -> None:
     for start in (State.SWITCH_ON_DISABLED, State.FAULT, State.QUICK_STOP_ACTIVE, State.SWITCHED_ON):
-        state, steps = start, 0
-        while state is not State.OPERATION_ENABLED:
-            state, steps = cia402.after(state, cia402.ENABLING[state]), steps + 1
-            assert steps < 6
+        state = start
+        limit = Limit("operation", steps=5)
+        while state is not State.OPERATION_ENABLED and limit.left():
+            state = cia402.after(state, cia402.ENABLING[state])
 
 
 @pytest.mark.parametrize("command", list(Command))

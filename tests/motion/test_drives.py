@@ -14,6 +14,7 @@ from services.comm.canopen import Abort, NmtCommand, NmtState, SdoAbortError, Sd
 from services.comm.cia402 import RECEIVED, SENT, Command, Fault, Object, State, from_units, state_of, to_units
 from services.motion.drive_link import DriveLink, DriveSettings
 from sim.drives import DriveBus, ratings
+from tests.waiting import Limit
 
 TPDO, RPDO = canopen.pdo_struct(SENT), canopen.pdo_struct(RECEIVED)
 CYCLE = 0.004
@@ -190,7 +191,8 @@ def test_mode_and_limits_cannot_change_while_the_motor_has_torque(bench: Bench) 
 def test_software_limits_cut_the_target(bench: Bench) -> None:
     bench.enable()
     start = bench.target
-    while bench.target < 3.0:
+    limit = Limit("the target", steps=1000)
+    while bench.target < 3.0 and limit.left():
         bench.target += 0.003
         bench.cycle(Command.ENABLE_OPERATION.word)
     bench.cycle(Command.ENABLE_OPERATION.word, 60)
@@ -224,7 +226,8 @@ def test_without_sync_the_drive_stops_by_itself(bench: Bench) -> None:
         bench.cycle(Command.ENABLE_OPERATION.word)
     assert bench.plant.qd[0] > 0.5
     silent = bench.now
-    while not bench.emergencies():
+    limit = Limit("an emergency message of the drive", steps=1000)
+    while not bench.emergencies() and limit.left():
         bench.step()
     assert bench.emergencies() == [Fault.SYNC_LOST]
     assert 9 * CYCLE <= bench.now - silent <= 11 * CYCLE + 1e-9
@@ -237,7 +240,8 @@ def test_without_the_masters_heartbeat_the_drive_stops_by_itself(bench: Bench) -
     bench.enable()
     bench.beats = False
     silent = bench.now
-    while not bench.emergencies():
+    limit = Limit("an emergency message of the drive", steps=1000)
+    while not bench.emergencies() and limit.left():
         bench.cycle(Command.ENABLE_OPERATION.word)
     assert bench.emergencies() == [Fault.HEARTBEAT]
     assert 0.2 - 2 * CYCLE <= bench.now - silent <= 0.2 + 2 * CYCLE

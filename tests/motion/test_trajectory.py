@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from services.motion.model import nominal_arm
 from services.motion.trajectory import Trajectory, braking_distance, reach_time, synchronised
+from tests.waiting import Limit
 
 ARM = nominal_arm()
 PERIOD = 0.004
@@ -74,7 +75,8 @@ def test_braking_ends_where_it_was_said_to_end(target: list[float], cycles: int)
         _advance(trajectory)
     rest, q, qd = trajectory.resting(trajectory.q, trajectory.qd), trajectory.q, trajectory.qd
     path = [q]
-    while not trajectory.still:
+    limit = Limit("rest", steps=10_000)
+    while not trajectory.still and limit.left():
         trajectory.accept(*trajectory.braking())
         path.append(trajectory.q)
     for number, pose in enumerate(path):

@@ -29,6 +29,7 @@ from services.scripted import ScriptError, load
 from services.setpoints import SetpointReceiver
 from services.timers import Timers
 from tests.node.conftest import Clock
+from tests.waiting import Limit
 
 PLAIN = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**63), 2**63) | st.floats(allow_nan=False) | st.text() | st.binary(),
@@ -296,7 +297,8 @@ def test_a_pipe_keeps_what_does_not_fit() -> None:
         a.post([n, bytes(100_000)])
     assert bool(a.unsent)
     got: list[int] = []
-    while len(got) < 40:
+    limit = Limit("40 items")
+    while len(got) < 40 and limit.left():
         got += [items[0] for items in b.read()]
         a.flush()
     assert (got, a.unsent) == (list(range(40)), False)
@@ -317,8 +319,8 @@ def test_of_states_only_the_newest_counts() -> None:
     assert driver.read() == [[0], [1], [2]]
     with pytest.raises(ValueError, match="do not fit into one datagram"):
         driver.send([bytes(1 << 20)])
-    sent = 0
-    while driver.send([bytes(1000)]):
+    sent, limit = 0, Limit("a full line", steps=100_000)
+    while driver.send([bytes(1000)]) and limit.left():
         sent += 1
     assert (sent > 10, driver.closed) == (True, False), "a reader that stands still must not stop the writer"
     actions.close()
@@ -484,7 +486,9 @@ class Process:
 
     def told(self) -> list[Any]:
         """The next that the loop says to its node."""
+        limit = Limit("a word of the loop")
         while True:
+            limit.left()
             select.select([self.node], [], [], 10.0)
             if items := self.node.read():
                 return items[0]
@@ -500,7 +504,9 @@ class Process:
 
 def states(link: NewestLink, until: Callable[[list[Any]], bool]) -> list[Any]:
     """Read states until one fits."""
+    limit = Limit("a state that fits")
     while True:
+        limit.left()
         select.select([link], [], [], 10.0)
         state = link.newest()
         assert not link.closed

@@ -27,6 +27,7 @@ from tests.node.test_lockstep import CALLS, Coordinator, World, trace_of
 from tests.node.test_lockstep import CELL as LOCKSTEP
 from tests.node.test_lockstep import Bench as LockstepBench
 from tests.ports import free_ports
+from tests.waiting import Limit
 
 pytestmark = pytest.mark.processes
 ROOT = Path(__file__).parents[2]
@@ -292,8 +293,8 @@ async def test_a_hanging_action_is_ended_at_its_deadline_while_the_node_answers(
     before = await pids(operator, "left", "")
     hanging = asyncio.create_task(operator.call("hang"))
     await operator.heard(Accepted)
-    answered = 0
-    while not hanging.done():
+    answered, limit = 0, Limit("the end of the call that hangs")
+    while not hanging.done() and limit.left():
         status = await operator.command("left", "status", "slide")
         assert status.ok
         answered += 1

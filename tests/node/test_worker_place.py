@@ -17,6 +17,7 @@ from services.runs import Answered, Begin, Ended, Hold, Order, Raised, Stop, Tol
 from services.worker import COMMAND, FAILED, PING, PONG, READY, STREAM_AT, WANTED, Setup
 from services.worker_place import MARGIN, NOT_READY, SILENT, WorkerPlace
 from tests.node.conftest import Clock
+from tests.waiting import Limit
 
 
 class FakeChild:
@@ -103,7 +104,8 @@ class Bench:
     def run(self, seconds: float) -> list[Any]:
         """Advance exactly when it says that it is due, as the shell does."""
         until, fresh = self.clock.now + seconds, []
-        while True:
+        limit = Limit("nothing more to be due", steps=100_000)
+        while limit.left():
             self.place.advance(self.clock.now)
             fresh += self.place.reports()
             due = self.place.due()
@@ -218,7 +220,8 @@ def test_one_that_keeps_dying_is_started_more_and_more_slowly() -> None:
     for _ in range(6):
         bench.children[-1].die()
         count = len(bench.children)
-        while len(bench.children) == count:
+        limit = Limit("a new child", steps=100)
+        while len(bench.children) == count and limit.left():
             due = bench.place.due()
             assert due is not None
             bench.clock.now = max(bench.clock.now, due)

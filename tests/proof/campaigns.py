@@ -20,6 +20,7 @@ from typing import Any
 from coordinator.campaign.rows import Row
 from coordinator.campaign.table import TABLE, read_table
 from tests.proof.proof import ROOT
+from tests.waiting import Limit
 
 FAST = 15.0
 """Times real time a core."""
@@ -141,7 +142,8 @@ def interrupted(sizes: Sizes, throws: int, regime: str) -> tuple[bool, int]:
     while kills < 4:
         going = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         wanted = (table.stat().st_size if table.exists() else 0) + chance.randint(1, 20_000)
-        while going.poll() is None and not (table.exists() and table.stat().st_size >= wanted):
+        limit = Limit("the next rows of the table", 3600.0)
+        while going.poll() is None and limit.left() and not (table.exists() and table.stat().st_size >= wanted):
             time.sleep(0.02)
         if going.poll() is not None:
             break

@@ -18,6 +18,7 @@ from coordinator.record.journal import MAGIC, PREFIX, JournalError, JournalWrite
 from coordinator.record.recording import JournalStore, ReplayError
 from services.comm import messages as m
 from tests.mission.toy_arm import WORK, Bench
+from tests.waiting import Limit
 
 GOLDEN = Path(__file__).parent / "golden" / "catch_ball-missed-and-recovered.journal"
 
@@ -31,8 +32,8 @@ def copy(folder: Path, content: bytes) -> Path:
 
 def bounds(raw: bytes) -> list[int]:
     """Where each record of a whole journal ends."""
-    ends, offset = [], len(MAGIC)
-    while offset < len(raw):
+    ends, offset, limit = [], len(MAGIC), Limit("the end of the journal", steps=len(raw))
+    while offset < len(raw) and limit.left():
         offset += PREFIX.size + PREFIX.unpack_from(raw, offset)[0]
         ends.append(offset)
     return ends

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import re
 import sys
-from types import SimpleNamespace
+from pathlib import Path
 from xml.etree import ElementTree
 
 import cv2
@@ -158,12 +159,24 @@ def test_without_resvg_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> N
         raster.unavailable.cache_clear()
 
 
-def test_a_host_without_fonts_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_font_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Words would be missing: pictures without words are not made."""
-    blank = SimpleNamespace(svg_to_bytes=lambda **_: b"the same picture")
-    monkeypatch.setitem(sys.modules, "resvg_py", blank)
+    monkeypatch.setattr(raster, "FONT", tmp_path / "gone.ttf")
     raster.unavailable.cache_clear()
     try:
-        assert "no fonts" in raster.unavailable()
+        assert "gone.ttf" in raster.unavailable()
     finally:
         raster.unavailable.cache_clear()
+
+
+def test_words_are_drawn_with_the_shipped_font_alone() -> None:
+    """The font is the published one, to the byte, and no font of the host is used, whichever a picture names."""
+    assert hashlib.sha256(raster.FONT.read_bytes()).hexdigest() == (
+        "3fdf69cabf06049ea70a00b5919340e2ce1e6d02b0cc3c4b44fb6801bd1e0d22"
+    )
+    picture = (
+        '<svg xmlns="http://www.w3.org/2000/svg" width="90" height="20">'
+        '<text y="15" font-family="{}">W&#246;rter: &#961; &#8804; 1</text></svg>'
+    )
+    named, others = raster.png(picture.format("DejaVu Sans")), ("Liberation Serif", "monospace", "system-ui")
+    assert all(raster.png(picture.format(family)) == named for family in others)

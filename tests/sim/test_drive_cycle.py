@@ -15,6 +15,7 @@ from services.comm.cia402 import RECEIVED, SENT, Command, Fault, Object, to_unit
 from sim import drives
 from sim.drives import Drive, DriveBus
 from sim.servo import DriveRating
+from tests.waiting import Limit
 
 CYCLE = 0.004
 RPDO = canopen.pdo_struct(RECEIVED)
@@ -76,7 +77,8 @@ class Bench:
     def transfer(self, node: int, *transfers: Transfer) -> None:
         client = SdoClient(node)
         client.begin(transfers)
-        while client.busy:
+        limit = Limit("the transfer", steps=1000)
+        while client.busy and limit.left():
             for frame in client.advance(self.now):
                 self.bus.receive(self.now, frame)
             for frame in self.bus.drain():

@@ -20,6 +20,8 @@ from typing import Any
 
 import pytest
 
+from tests.waiting import Limit
+
 ROOT = Path(__file__).parents[2]
 PATIENCE = 120.0
 """s that a condition may take on a slow machine."""
@@ -50,7 +52,8 @@ class Operator:
         lines = ["GET /api/live HTTP/1.1", f"Host: {host}:{port}", "Upgrade: websocket", "Connection: Upgrade"]
         lines += [f"Sec-WebSocket-Key: {key}", "Sec-WebSocket-Version: 13", f"Authorization: Bearer {token}", "", ""]
         self._socket.sendall("\r\n".join(lines).encode())
-        while b"\r\n\r\n" not in self._rest:
+        limit = Limit("the end of the head")
+        while b"\r\n\r\n" not in self._rest and limit.left():
             self._more()
         head, self._rest = self._rest.split(b"\r\n\r\n", 1)
         assert head.startswith(b"HTTP/1.1 101"), head
@@ -62,7 +65,8 @@ class Operator:
         self._rest += data
 
     def _take(self, count: int) -> bytes:
-        while len(self._rest) < count:
+        limit = Limit(f"{count} bytes")
+        while len(self._rest) < count and limit.left():
             self._more()
         data, self._rest = self._rest[:count], self._rest[count:]
         return data
@@ -77,8 +81,9 @@ class Operator:
         self._socket.sendall(bytes([0x80 | code]) + size + mask + bytes(b ^ mask[i % 4] for i, b in enumerate(body)))
 
     def _hear_text(self) -> str:
-        whole = b""
+        whole, limit = b"", Limit("a whole message")
         while True:
+            limit.left()
             first, second = self._take(2)
             size = second & 0x7F
             if size >= 126:
@@ -145,7 +150,8 @@ class Operator:
         """Give a command and listen until it is answered."""
         self._number += 1
         self.say(type="command", id=self._number, verb=verb, data=data)
-        while self._number not in self.answers:
+        limit = Limit(f"the answer to {verb}")
+        while self._number not in self.answers and limit.left():
             self.hear()
         return self.answers[self._number]
 
@@ -153,7 +159,8 @@ class Operator:
         """The state as the changes made it, and the snapshot that was asked for after them."""
         told = self.state
         self.say(type="resync")
-        while self.hear() != "snapshot":
+        limit = Limit("the snapshot")
+        while self.hear() != "snapshot" and limit.left():
             pass
         assert told is not self.state
         return told, self.state
@@ -209,7 +216,8 @@ def test_a_foreign_operator_steers_a_catch_and_sees_what_the_coordinator_sees(op
     assert [throw["caught"] for throw in operator.state["result"]["throws"]] == [True, True]
 
     told, now = operator.resynced()
-    while told["sequence"] != now["sequence"]:  # what happened meanwhile came with the snapshot
+    limit = Limit("a quiet moment")
+    while told["sequence"] != now["sequence"] and limit.left():  # what happened meanwhile came with the snapshot
         told, now = operator.resynced()
     assert told == now
     assert {"fired", "marking", "run_started", "run_ended", "device", "image", "setpoint", "paused"} <= operator.kinds
