@@ -325,3 +325,36 @@ def test_choices_without_a_single_action_are_refused() -> None:
     """A place that is entered although nothing was measured there."""
     with pytest.raises(ValueError, match="no action has a probability"):
         play(FORK, [Throw(1, 0.0, runs=[entry("a", 1.0)])])
+
+
+@pytest.mark.parametrize(("threshold", "seconds"), [("busy", 3.0), ("busy*2", 2.0), ("busy*3", 1.0)])
+def test_an_inhibitor_holds_back_until_its_place_holds_less(threshold: str, seconds: float) -> None:
+    """a ends after 1 s; b empties busy in steps, after 2 and 3 s; what `!busy*k` inhibits fires when fewer than k are left."""
+    text = """
+[places.busy]
+kind = "control"
+[places.half]
+kind = "control"
+[transitions.begin]
+in = ["jobs"]
+out = ["a", "b", "busy*2"]
+[transitions.done]
+in = ["a:normal", "!{threshold}"]
+out = ["end"]
+[transitions.first]
+in = ["b:normal", "busy"]
+out = ["half"]
+[transitions.second]
+in = ["half", "busy"]
+out = []
+after = 1.0
+[transitions.a_lost]
+in = ["a:error"]
+out = ["end"]
+[transitions.b_lost]
+in = ["b:error"]
+out = ["end"]
+"""
+    throws = [Throw(1, 0.0, runs=[entry("a", 1.0, taken="done"), entry("b", 2.0, taken="first")])]
+    played = play(text.replace("{threshold}", threshold), throws, n=20)
+    assert played.time.tolist() == [seconds] * 20

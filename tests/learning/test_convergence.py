@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from coordinator.learning.automata import NikolicFu
+from coordinator.learning.batch import Trial
 from coordinator.learning.rule import Rule
 from coordinator.learning.selectors import RULES
 from coordinator.learning.tracking import Tracking
@@ -106,3 +107,24 @@ def test_tracking_seldom_sees_a_change_where_there_is_none() -> None:
     """False alarms in 2,000 trials of a world that stays."""
     played = play(Tracking(), free(0.2), 2000, 300, np.random.default_rng(4))
     assert np.mean(played.batch.own["restarts"] > 0) < 0.1
+
+
+def test_tracking_follows_a_small_move_late_in_its_life() -> None:
+    """R moves by 0.13, which few tests notice, after 4,000 trials: the floor of the gain follows within 600.
+
+    Without the floor the gain is 1 / 4000^0.7 = 0.003 by then, and p of the new best action is 0.76 instead of 0.96.
+    """
+    world = World("drifting", (0.85, 0.72), (0.0, 0.0), 4000, (0.72, 0.85))
+    played = play(Tracking(), world, 4600, 100, np.random.default_rng(5))
+    assert played.p_best[0].mean() > 0.9
+
+
+def test_the_gain_of_tracking_never_falls_below_its_floor() -> None:
+    """One trial after ten thousand: p moves towards the best action by exactly the floor, and every action stays possible."""
+    rule, p = Tracking(), np.array([[0.9, 0.1]])
+    batch = rule.begin(1, 2)
+    batch.p[:], batch.k[:], batch.tries[:], batch.runs[:], batch.successes[:] = p, 10_000, 5_000, 100, [[10, 90]]
+    rule.learn(batch, Trial(np.array([1]), np.array([1.0]), np.array([np.nan]), np.array([True])))
+    assert batch.p == pytest.approx(p + rule.gain_floor * (np.array([[0.0, 1.0]]) - p))
+    batch.p[:] = [[1.0, 0.0]]
+    assert rule.probabilities(batch, np.ones((1, 2), bool)).min() == pytest.approx(rule.probability_floor)
