@@ -159,7 +159,7 @@ class World:
             if self.bench.executor.finished is not None:
                 break
         else:
-            raise AssertionError(f"it does not end: {self.bench.executor.state}")
+            raise AssertionError(f"it does not end: {self.started}")
         twice = [id_ for id_, count in self.started.items() if count > 1]
         assert not twice, f"executed twice: {twice}"
         steps = [*self.journal, *self.bench.steps]
