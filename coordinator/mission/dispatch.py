@@ -7,7 +7,7 @@ over, and after a resume it asks the nodes for the runs that an earlier process 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from coordinator.engine import Instruction, State, Stimulus
@@ -22,9 +22,10 @@ from coordinator.engine.instructions import (
     StartRun,
 )
 from coordinator.engine.stimuli import Hold, Pause, RunEnded, RunHeld, RunStarted, StopConfirmed, StopFailed, TimerFired
-from coordinator.mission.fences import FOR_GOOD, UNSURE, Fences
+from coordinator.mission.fences import FOR_GOOD, FORGOTTEN, UNSURE, Fences
 from coordinator.mission.timekeeping import Timers
 from coordinator.task import Executed, Status
+from services.comm import messages
 from services.comm.caller import Caller
 from services.comm.directory import Directory
 from services.comm.messages import Answer, Call, Command, Outcome
@@ -32,6 +33,8 @@ from services.comm.messages import Answer, Call, Command, Outcome
 ESCALATION: Final = 3.0
 """Seconds after a run's own time to stop that its node needs at most for the stop routine and the kill of its worker."""
 RESUMED: Final = "resumed"
+NO_BOOT: Final = "unknown"
+"""Names no boot of a node: boots are drawn as hexadecimal numbers."""
 _GIVEN_UP: Final = UNSURE | {RESUMED, "refused", "unreachable"}
 """Causes by which this side ended a run without word of its node."""
 _TIMERS: Final = (ArmTimer, DisarmTimer, HoldTimer, ReleaseTimer)
@@ -48,8 +51,15 @@ class Flight:
     waits: bool = False
     """For the fence of its device."""
     cancelled: bool = False
+    boot: str = ""
+    """The boot of its node that an earlier process may have called already; empty: no process has."""
     abandon: bool = False
     """If its node says that it still goes on, it is ended here: its action's `on_resume` is `error`."""
+
+    @property
+    def if_unsent(self) -> Executed:
+        """Whether it was executed, if this process never sends it."""
+        return Executed.UNKNOWN if self.boot else Executed.NO
 
 
 class Dispatch:
@@ -72,6 +82,8 @@ class Dispatch:
         """By node: ids that it still knew when it welcomed us and nobody has settled yet."""
         self._earlier: dict[str, tuple[StartRun, str]] = {}
         """Runs that an earlier process started, with the boot of their node as it was then."""
+        self._accepted: set[str] = set()
+        """Runs that their node had accepted in an earlier process."""
         self._settled: dict[str, bool] = {}
         """Runs that ended in an earlier process, and whether their node said so."""
         self._orders: Mapping[type, Callable[[float, Any], list[Stimulus]]] = {
@@ -116,30 +128,30 @@ class Dispatch:
 
     # --- orders ------------------------------------------------------------------------------------------------------
 
-    def _start(self, now: float, start: StartRun, boot: str = "", known: bool = False) -> list[Stimulus]:
+    def _start(self, now: float, start: StartRun) -> list[Stimulus]:
         entry = self.directory.actions.get(start.action)
         if entry is None:
             text = f"{self.directory.source}: no node offers {start.action}"
             return [RunEnded(start.run, Status.ERROR, "not_offered", text, Executed.NO)]
         flight = self.flights[start.run] = Flight(start, entry.node, entry.device, now)
-        if entry.device in self._fences and not entry.at_once and not known:
+        if entry.device in self._fences and not entry.at_once:
             flight.waits = True
         else:
-            self._call(now, flight, boot)
+            self._call(now, flight)
         return []
 
-    def _call(self, now: float, flight: Flight, boot: str = "") -> None:
+    def _call(self, now: float, flight: Flight) -> None:
         flight.waits = False
-        start = flight.start
+        start, boot = flight.start, flight.boot
         arguments = {**self.directory.actions[start.action].args, **start.arguments}
         call = Call(self.call_id(start.run), start.action, arguments, start.deadline, boot=boot, seed=self._seed)
-        self.callers[flight.node].call(now, call)
+        self.callers[flight.node].call(now, replace(call, again=bool(boot)))
 
     def _cancel(self, now: float, cancel: CancelRun) -> list[Stimulus]:
         flight = self.flights.get(cancel.run)
         if flight is None or flight.waits:
             self.flights.pop(cancel.run, None)
-            return [StopConfirmed(cancel.run, Executed.NO)]
+            return [StopConfirmed(cancel.run, Executed.NO if flight is None else flight.if_unsent)]
         flight.cancelled = True
         within = cancel.within + ESCALATION
         self.callers[flight.node].cancel(now, self.call_id(cancel.run), cancel.reason, within)
@@ -248,7 +260,7 @@ class Dispatch:
         for run, flight in [(r, f) for r, f in self.flights.items() if f.waits and now >= f.begun + f.start.deadline]:
             del self.flights[run]
             text = f"{flight.device} is not known to stand still after {self._fences[flight.device].run}"
-            stimuli.append(RunEnded(run, Status.ERROR, "device_fenced", text, Executed.NO))
+            stimuli.append(RunEnded(run, Status.ERROR, "device_fenced", text, flight.if_unsent))
         return stimuli
 
     def _go_on(self, now: float, device: str) -> None:
@@ -276,6 +288,8 @@ class Dispatch:
         self._boots.update(boots)
         if isinstance(stimulus, TimerFired):
             self._timers.disarm(stimulus.key)
+        elif isinstance(stimulus, RunStarted):
+            self._accepted.add(stimulus.run)
         elif isinstance(stimulus, RunEnded | StopConfirmed):
             self._relive_end(now, stimulus)
         elif isinstance(stimulus, StopFailed):
@@ -336,14 +350,30 @@ class Dispatch:
         entry = self.directory.actions.get(start.action)
         if entry is None:
             return self._start(now, start)
-        known = self.call_id(start.run) in self._kept.get(entry.node, ())
-        boot = self.callers[entry.node].boot if known else self._earlier.get(start.run, (start, ""))[1]
-        stimuli = self._start(now, start, boot, known)
-        self.flights[start.run].abandon = entry.on_resume == "error"
-        if entry.on_resume == "ask":
-            text = f"{start.action} was going on when the coordinator ended: go on with it?"
-            stimuli.append(Pause(text))
+        stimuli = self._ask_again(now, start)
+        if start.run in self.flights:
+            self.flights[start.run].abandon = entry.on_resume == "error"
+            if entry.on_resume == "ask":
+                stimuli.append(Pause(f"{start.action} was active when the coordinator ended: continue it?"))
         return stimuli
+
+    def _ask_again(self, now: float, start: StartRun, stopping: bool = False) -> list[Stimulus]:
+        """Call a run again that an earlier process may have called. One that its node had accepted and neither executes nor
+        keeps any more was forgotten there: it ends without a call."""
+        entry = self.directory.actions[start.action]
+        present, id_ = self.callers[entry.node].boot, self.call_id(start.run)
+        known = id_ in self._kept.get(entry.node, ())
+        boot = present if known else self._earlier.get(start.run, (start, ""))[1]
+        flight = Flight(start, entry.node, entry.device, now, cancelled=stopping, boot=boot or NO_BOOT)
+        self.flights[start.run] = flight
+        if not known and boot == present and start.run in self._accepted:
+            text = f"{entry.node} had accepted it and keeps neither the run nor its result any more"
+            return self.ended(now, Outcome(id_, Status.ERROR, {}, FORGOTTEN, text, messages.Executed.UNKNOWN))
+        if entry.device in self._fences and not entry.at_once and not known:
+            flight.waits = True
+        else:
+            self._call(now, flight)
+        return []
 
     def _abandon(self, now: float, run: str) -> list[Stimulus]:
         flight = self.flights.pop(run)
@@ -356,15 +386,13 @@ class Dispatch:
 
     def _cancel_again(self, now: float, cancel: CancelRun, state: State) -> list[Stimulus]:
         run = state.run(cancel.run)
-        if run is not None and run.action in self.directory.actions:
-            primitive = self._earlier[run.id][0].primitive_task if run.id in self._earlier else ""
-            self._rejoin_to_stop(now, StartRun(run.id, run.place, primitive, run.action, run.arguments, cancel.within))
-        return self._cancel(now, cancel)
-
-    def _rejoin_to_stop(self, now: float, start: StartRun) -> None:
-        """A run that is stopping: asked for under its old id only to hear of its end."""
-        self._rejoin(now, start)
-        self.flights[start.run].abandon = False
+        if run is None or run.action not in self.directory.actions:
+            return self._cancel(now, cancel)
+        primitive = self._earlier[run.id][0].primitive_task if run.id in self._earlier else ""
+        # Asked for under its old id only to receive its end.
+        start = StartRun(run.id, run.place, primitive, run.action, run.arguments, cancel.within)
+        stimuli = self._ask_again(now, start, stopping=True)
+        return self._cancel(now, cancel) if run.id in self.flights else stimuli
 
 
 def _run_ended(run: str, outcome: Outcome) -> RunEnded:

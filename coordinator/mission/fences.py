@@ -9,9 +9,10 @@ from typing import Final
 STOP_MARGIN: Final = 2.0
 """Seconds that a node's stop routine may take after a run's orphan time (docs/semantics.md, cancel)."""
 REBOOTED: Final = "rebooted"
-UNSURE: Final = frozenset({"lost", "no_answer", "not_accepted", REBOOTED})
-"""Causes after which a device may still be moving: its node has not said that the run is over, or is another process, and the
-former one's devices may be in the middle of their stop routines."""
+FORGOTTEN: Final = "forgotten"
+UNSURE: Final = frozenset({"lost", "no_answer", "not_accepted", REBOOTED, FORGOTTEN})
+"""Causes after which a device may still be moving: its node has not said that the run is over, or cannot say how it ended, or is
+another process, and the former one's devices may be in the middle of their stop routines."""
 FOR_GOOD: Final = math.inf
 
 
@@ -46,12 +47,13 @@ class Fences:
     def after(self, cause: str, now: float, orphan_time: float | None) -> float:
         """Until when a device is fenced whose run ended for this cause.
 
-        A node that was lost stops the run itself once it has missed its coordinator for the orphan time. One that is there and
-        does not say that the run has stopped can be waited for only.
+        A node that was lost stops the run itself once it has missed its coordinator for the orphan time. One that was started
+        again, or has forgotten the run, does not execute it any more. One that is there and does not say that the run has
+        stopped can be waited for only.
         """
         if cause == "no_answer":
             return FOR_GOOD
-        return now + STOP_MARGIN + (0.0 if cause == REBOOTED else orphan_time or 0.0)
+        return now + STOP_MARGIN + (0.0 if cause in (REBOOTED, FORGOTTEN) else orphan_time or 0.0)
 
     def lift(self, run: str) -> list[str]:
         """The run is known to be over: gives the devices that are free by that."""

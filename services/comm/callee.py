@@ -4,14 +4,15 @@ Used alike in real time (`server.py` drives it) and in lock step. The node takes
 `finish`, `feedback`, `raise_event` and `answer`. What it promises:
 
 - A call id is run at most once in the life of this boot: a known id is re-attached or answered from its stored result, one
-  that was acknowledged or forgotten is remembered as an id.
+  whose result is gone is remembered as an id. Once the memory for ids was full (`FinishedIds.complete`), a call that may have
+  been sent before (`Call.again`) and is not known does not run: it may be among those forgotten.
 - Every run ends with one outcome, kept until its caller acknowledges it or `Keeping.results` is over.
 - A run goes on no longer than its deadline, and no longer without its caller than its offer's `orphan_time`.
 - A device takes orders from one caller at a time: the holder of its lease.
 
 Refusals are outcomes with status error and executed = no: unknown_service, local_only, old_epoch, device_leased,
 device_needs_coordinator, cancelled (before it began), and busy from the node's runner. executed = unknown: rebooted (meant
-for another boot), forgotten (its result was kept no longer).
+for another boot), forgotten (its result was kept no longer, or perhaps not even its id).
 """
 
 from __future__ import annotations
@@ -150,6 +151,10 @@ class Callee:
             text = f"this call was meant for another boot of {self.name}"
             self._messages.append((peer, Outcome(id_, ERROR, {}, "rebooted", text, Executed.UNKNOWN)))
             return
+        if call.again and not self._results.gone.complete:
+            # Before any refusal: that would say that it was not executed.
+            self._end(now, peer, self._maybe_forgotten(id_))
+            return
         offer = self.offers.get(call.service)
         refusal = self._peers.refusal_of_call(now, peer, call, offer, self._in_use)
         if refusal is not None or offer is None:
@@ -170,7 +175,7 @@ class Callee:
         results = self._results
         if offer is None or offer.inline is None or id_ in results.kept or id_ in results.gone or id_ in self._running:
             return None
-        if call.boot and call.boot != self.boot:
+        if (call.boot and call.boot != self.boot) or (call.again and not results.gone.complete):
             return None
         if self._peers.refusal_of_call(now, peer, call, offer, self._in_use) is not None:
             return None
@@ -207,6 +212,10 @@ class Callee:
             text = "its result was kept no longer"
             self._messages.append((peer, Outcome(id_, ERROR, {}, "forgotten", text, Executed.UNKNOWN)))
 
+    def _maybe_forgotten(self, id_: str) -> Outcome:
+        text = f"{self.name} has forgotten ids of its oldest calls, and this one may be among them"
+        return Outcome(id_, ERROR, {}, "forgotten", text, Executed.UNKNOWN)
+
     def _in_use(self, device: str) -> bool:
         return any(run.device == device for run in self._running.values())
 
@@ -229,7 +238,7 @@ class Callee:
         self._orders.append(StartRun(call, peer))
 
     def _take_ack(self, now: float, peer: str, ack: ResultAck) -> None:
-        self._results.acknowledge(now, peer, (ack.id, *ack.more))
+        self._results.acknowledge(peer, (ack.id, *ack.more))
 
     def _take_cancel(self, now: float, peer: str, cancel: Cancel) -> None:
         run = self._running.get(cancel.id)
@@ -238,6 +247,8 @@ class Callee:
                 self._stop(cancel.id, run, cancel.reason or "cancelled", "cancelled")
         elif cancel.id in self._results:
             self._known(peer, cancel.id)
+        elif not self._results.gone.complete:
+            self._end(now, peer, self._maybe_forgotten(cancel.id))
         else:
             # The call itself may still be on its way: remember that it must not begin.
             self._end(now, peer, Outcome(cancel.id, ERROR, {}, "cancelled", cancel.reason, Executed.NO))

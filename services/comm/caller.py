@@ -4,7 +4,8 @@ Used alike in real time (`client.py` drives it) and in lock step (its messages t
 
 - Every call ends with exactly one `Ended`, whatever happens to the link or the peer.
 - No call is ever made again under another id. After a lost link the same call is sent again under the same id to the same
-  boot of the peer, which knows the id and runs it at most once; another boot is never sent it.
+  boot of the peer, marked `again`: the peer knows the id, or says that it may have forgotten it, and runs it at most once.
+  Another boot is never sent it.
 - What the caller decides by itself is ERROR with a cause (the table in docs/protocol.md): executed = no where the call never
   left, unknown otherwise, also when its owner names the boot it was meant for: he may have sent it before he was restarted.
 """
@@ -79,7 +80,16 @@ class Caller:
     def call(self, now: float, call: m.Call) -> None:
         """Make a call. Raises ValueError for an id that is under way, NotPlainError for arguments that no message carries."""
         self.begin(
-            now, call.id, call.service, call.arguments, call.deadline, call.parent, call.seed, call.epoch, call.boot
+            now,
+            call.id,
+            call.service,
+            call.arguments,
+            call.deadline,
+            call.parent,
+            call.seed,
+            call.epoch,
+            call.boot,
+            again=call.again,
         )
 
     def begin(
@@ -94,6 +104,7 @@ class Caller:
         epoch: int = 0,
         boot: str = "",
         waiter: Waiter | None = None,
+        again: bool = False,
     ) -> int:
         """`call` by the fields of a Call. `waiter` is told its end in place of a notice, and its result acknowledged then.
 
@@ -103,7 +114,9 @@ class Caller:
             raise ValueError(f"call {id}: this id is under way already")
         if arguments:
             arguments = plain(arguments, "arguments")
-        call = m.Call(id, service, arguments, deadline, epoch or self.hello.epoch, boot or self.boot, parent, seed)
+        call = m.Call(
+            id, service, arguments, deadline, epoch or self.hello.epoch, boot or self.boot, parent, seed, again
+        )
         if self.up:
             due = now + self._patience.accept
             self._pending[id] = Pending(call, not boot, now, waiter, True, False, None, due)
@@ -129,7 +142,7 @@ class Caller:
         pending = self._pending.get(id)
         if pending is None or pending.cancel is not None:
             return
-        if not pending.sent and pending.any_boot:
+        if not pending.sent and pending.if_unsent is m.Executed.NO:
             self._end(id, "cancelled", reason, m.Executed.NO)
             return
         pending.cancel = reason
@@ -359,6 +372,8 @@ class Caller:
         call = pending.call
         if pending.any_boot and call.boot != self.boot:
             call = pending.call = replace(call, boot=self.boot)
+        if pending.sent and not call.again:
+            call = pending.call = replace(call, again=True)
         pending.sent, pending.accepted = True, False
         due = now + self._patience.accept
         self._pending.watch_accept(pending, due)

@@ -51,7 +51,7 @@ MAX_CONTAINERS = 100_000
 """Most arrays and maps in one message: one byte each on the wire, some 70 in memory."""
 UNCOUNTED = 64 * KIB
 """Bodies up to so many bytes are read without counting their arrays and maps."""
-_SELDOM = frozenset((m.Outcome.KIND,))
+_SELDOM = frozenset((m.Call.KIND, m.Outcome.KIND))
 """Kinds whose last field, a bool, is left out when it is false: a peer that does not know it yet is not bothered with it."""
 _NUMBERS = frozenset((float, int))
 _TICK = Tick.KIND

@@ -65,7 +65,8 @@ READERS: Mapping[int, Reader] = {Call.KIND: _call, Outcome.KIND: _outcome}
 
 
 def _call_row(call: Any) -> tuple[Any, ...]:
-    return (4, call.id, call.service, call.arguments, call.deadline, call.epoch, call.boot, call.parent, call.seed)
+    row = (4, call.id, call.service, call.arguments, call.deadline, call.epoch, call.boot, call.parent, call.seed)
+    return (*row, True) if call.again else row  # seldom: after a broken link or a restart of the caller
 
 
 def _outcome_row(end: Any) -> tuple[Any, ...]:

@@ -86,6 +86,10 @@ class Call:
     """Id of the call on whose behalf this one is made; cancelled with it."""
     seed: int = 0
     """Seed of the mission run: an action's random draws are keyed by it."""
+    again: bool = False
+    """It may have been sent before: a node that cannot rule out that it ran and was forgotten does not run it.
+
+    Left out on the wire when false."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
@@ -22,10 +21,8 @@ class Keeping:
     """and how many of them,"""
     result_bytes: int = 64 << 20
     """and how much they may weigh together (bytes, about as on the wire); the newest is kept whatever it weighs."""
-    ids: float = 3_600.0
-    """Seconds that an id whose result is gone is remembered,"""
-    id_count: int = 200_000
-    """and how many of them."""
+    id_groups: int = 100_000
+    """Groups of ids that are remembered once their results are gone (`FinishedIds`); there is no limit of time."""
     lease: float = 2.0
     """Seconds after which the lease of a device is free when its holder is away and none of its runs goes on."""
 
@@ -52,6 +49,44 @@ def weight_of(value: Any) -> int:
     return _SCALAR
 
 
+_DIGITS = "0123456789"
+_GROUP = 4_096
+"""Numbers in one group: 512 bytes when all of them are used."""
+
+
+class FinishedIds:
+    """Ids of calls whose results are gone, grouped so that they need never be forgotten in ordinary use.
+
+    Callers count their calls (docs/protocol.md, `id`), so an id is split into its text and its trailing number, and the
+    numbers of one text are kept as bits. At most `limit` groups of 4,096 numbers are kept, the oldest is forgotten first.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._groups: OrderedDict[tuple[str, int], int] = OrderedDict()
+        self.complete = True
+        """Whether no id was ever forgotten: then an unknown id has never been here."""
+
+    def __contains__(self, id_: object) -> bool:
+        text, number = _split(str(id_))
+        return self._groups.get((text, number // _GROUP), 0) >> number % _GROUP & 1 == 1
+
+    def add(self, id_: str) -> None:
+        """Remember an id."""
+        text, number = _split(id_)
+        groups, group = self._groups, (text, number // _GROUP)
+        groups[group] = groups.get(group, 0) | 1 << number % _GROUP
+        if len(groups) > self._limit:
+            groups.popitem(last=False)
+            self.complete = False
+
+
+def _split(id_: str) -> tuple[str, int]:
+    """An id as its text and its trailing number; no two ids give the same, since leading zeros stay with the text."""
+    digits = len(id_[len(id_.rstrip(_DIGITS)) :].lstrip("0"))
+    return (id_[:-digits], int(id_[-digits:])) if digits else (id_, 0)
+
+
 class ResultStore:
     """Results by call id. `forgotten` is told each id whose result goes."""
 
@@ -61,17 +96,13 @@ class ResultStore:
         # A plain dict is slow to find its first entry once many were deleted before it.
         self._results: OrderedDict[str, tuple[Outcome, str, float, int]] = OrderedDict()
         self._weight = 0
-        self._ids: OrderedDict[str, float] = OrderedDict()
-        self._ids_due = math.inf
-        """Not later than when the oldest id has been remembered long enough (s)."""
-
         self.kept: Collection[str] = self._results.keys()
         """Ids whose result is kept,"""
-        self.gone: Collection[str] = self._ids.keys()
+        self.gone = FinishedIds(keeping.id_groups)
         """and those whose result is gone; both for quick looks, see `in`."""
 
     def __contains__(self, id_: str) -> bool:
-        return id_ in self._ids or id_ in self._results
+        return id_ in self._results or id_ in self.gone
 
     def add(self, now: float, peer: str, outcome: Outcome, weight: int | None = None) -> None:
         """Keep a result for its caller. `weight` is its length on the wire (bytes) where that is known, else it is estimated."""
@@ -84,7 +115,7 @@ class ResultStore:
         while len(results) > self._keeping.result_count or (
             self._weight > self._keeping.result_bytes and len(results) > 1
         ):
-            self._forget(now, next(iter(results)))
+            self._forget(next(iter(results)))
 
     def get(self, id_: str) -> Outcome | None:
         """The result of this call, None if it is not kept (any more)."""
@@ -96,13 +127,13 @@ class ResultStore:
         stored = self._results.get(id_)
         return "" if stored is None else stored[1]
 
-    def acknowledge(self, now: float, peer: str, ids: Iterable[str]) -> None:
+    def acknowledge(self, peer: str, ids: Iterable[str]) -> None:
         """The caller has these results safe; of others' ids nothing is forgotten."""
         get = self._results.get
         for id_ in ids:
             stored = get(id_)
             if stored is not None and stored[1] == peer:
-                self._forget(now, id_)
+                self._forget(id_)
 
     def of(self, peer: str) -> list[str]:
         """Ids of the results kept for this caller."""
@@ -117,23 +148,9 @@ class ResultStore:
     def advance(self, now: float) -> None:
         """Forget what has been kept long enough."""
         while (due := self.due()) is not None and due <= now:
-            self._forget(now, next(iter(self._results)))
+            self._forget(next(iter(self._results)))
 
-    def _forget(self, now: float, id_: str) -> None:
+    def _forget(self, id_: str) -> None:
         self._weight -= self._results.pop(id_)[3]
-        self._ids[id_] = now
-        if now >= self._ids_due or len(self._ids) > self._keeping.id_count:
-            self._forget_ids(now)
-        elif len(self._ids) == 1:
-            self._ids_due = now + self._keeping.ids
+        self.gone.add(id_)
         self._forgotten(id_)
-
-    def _forget_ids(self, now: float) -> None:
-        self._ids_due = math.inf
-        while self._ids:
-            oldest = next(iter(self._ids))
-            due = self._ids[oldest] + self._keeping.ids
-            if len(self._ids) <= self._keeping.id_count and due > now:
-                self._ids_due = due
-                break
-            del self._ids[oldest]

@@ -62,8 +62,8 @@ class Pending:
 
     @property
     def if_unsent(self) -> Executed:
-        """What is known when it ends unsent: an owner that names a boot may have sent it before he was restarted."""
-        return Executed.NO if self.any_boot else Executed.UNKNOWN
+        """What is known when it ends unsent: its owner may have sent it before the owner was restarted."""
+        return Executed.NO if self.any_boot and not self.call.again else Executed.UNKNOWN
 
 
 class UnderWay(dict[str, Pending]):

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from services.comm import messages as m
 from services.comm.callee import Callee, CancelRun, Commanded, Keeping, Offer, StartRun
 from services.comm.messages import Executed
+from services.comm.results import FinishedIds
 
 COORD = m.Hello(1, 1, "coordinator", "coord", "c1", 3, "d1")
 
@@ -271,17 +274,55 @@ def test_results_are_forgotten_by_number_and_by_time_ids_are_not() -> None:
         assert _outcome(callee)[1] == cause
 
 
-def test_ids_are_forgotten_in_the_end() -> None:
-    callee = _callee(keeping=Keeping(ids=100.0, id_count=2))
-    for n in range(4):
-        callee.receive(0.0, "coord", m.Call(str(n), "get", epoch=3))
-        callee.receive(0.0, "coord", m.ResultAck(str(n)))
+def _called_and_acknowledged(callee: Callee, *ids: str) -> None:
+    for id_ in ids:
+        callee.receive(0.0, "coord", m.Call(id_, "get", epoch=3))
+        callee.receive(0.0, "coord", m.ResultAck(id_))
     _said(callee)
-    seen = []
-    for n in (3, 2, 1, 0):
-        callee.receive(0.0, "coord", m.Call(str(n), "get", epoch=3))
-        seen.append(_outcome(callee)[1])
-    assert seen == ["forgotten", "forgotten", "", ""]
+
+
+def test_ids_that_count_up_are_never_forgotten() -> None:
+    """Neither by number nor by age: a day and twice as many calls as an id was remembered for before."""
+    callee = _callee(keeping=Keeping(id_groups=100))
+    _called_and_acknowledged(callee, *(f"m/work#{n}" for n in range(1, 400_000)))
+    callee.advance(86_400.0)
+    for n in (1, 4_095, 4_096, 200_000, 399_999):
+        callee.receive(86_400.0, "coord", m.Call(f"m/work#{n}", "get", epoch=3))
+        assert _outcome(callee) == ("error", "forgotten", Executed.UNKNOWN)
+    callee.receive(86_400.0, "coord", m.Call("m/work#400000", "get", epoch=3, again=True))
+    assert _outcome(callee)[0] == "success", "it has never been here, and the node knows that"
+
+
+def test_a_node_that_has_forgotten_ids_runs_no_call_that_may_be_among_them() -> None:
+    callee = _callee(keeping=Keeping(id_groups=2))
+    _called_and_acknowledged(callee, "work-1", "a", "b")
+    for service in ("get", "move"):
+        again = m.Call(f"{service}/work-2", service, epoch=3, again=True)
+        assert callee.answer_inline(0.0, "coord", again) is None
+        for _ in range(2):  # and it is remembered that it was answered so
+            callee.receive(0.0, "coord", again)
+            assert _outcome(callee) == ("error", "forgotten", Executed.UNKNOWN) and callee.orders() == []
+    callee.receive(0.0, "coord", m.Call("work-3", "get", epoch=3))
+    assert _outcome(callee)[0] == "success", "a first call is not among them"
+    callee.receive(0.0, "coord", m.Cancel("work-1"))
+    assert _outcome(callee) == ("error", "forgotten", Executed.UNKNOWN), "nothing is said not to have run"
+    refused = m.Call("work-4", "move", epoch=2, again=True)
+    callee.receive(0.0, "coord", refused)
+    assert _outcome(callee) == ("error", "forgotten", Executed.UNKNOWN), "nor is it refused as not executed"
+
+
+@given(st.lists(st.tuples(st.sampled_from(["", "a", "a0", "a1", "#", "a/00"]), st.integers(0, 5_000)), max_size=60))
+def test_ids_in_groups_are_the_ids(ids: list[tuple[str, int]]) -> None:
+    known, added = FinishedIds(1_000), set[str]()
+    for text, number in ids:
+        for id_ in (text, f"{text}{number}"):
+            assert (id_ in known) == (id_ in added)
+            known.add(id_)
+            added.add(id_)
+    for text, number in ids:
+        for id_ in (f"{text}{number}", f"{text}{number + 1}", f"{text}0{number}", f"{text}{number + 4_096}"):
+            assert (id_ in known) == (id_ in added), id_
+    assert known.complete
 
 
 def test_what_cannot_be_sent_is_an_error_of_the_action() -> None:

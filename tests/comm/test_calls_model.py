@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from services.comm import messages as m
-from services.comm.callee import Callee, CancelRun, Offer, StartRun
+from services.comm.callee import Callee, CancelRun, Keeping, Offer, StartRun
 from services.comm.caller import Caller, Ended, Late, PeerBack
 from services.comm.messages import Executed
 
@@ -52,7 +52,8 @@ class World:
     def _new_callee(self) -> Callee:
         offers = {f"act{n}": Offer(device=f"arm{n}", orphan_time=1.0) for n in range(DEVICES)}
         offers["get"] = Offer(inline=self._inline)
-        return Callee("motion", f"n{self.boot}", offers)
+        offers["flooded"] = Offer(inline=lambda now, call: m.Outcome(call.id, "success"))
+        return Callee("motion", f"n{self.boot}", offers, keeping=Keeping(results=3.0, result_count=4, id_groups=2))
 
     def _new_caller(self) -> Caller:
         return Caller("motion", m.Hello(1, 1, "coordinator", COORD, f"c{self.epoch}", self.epoch))
@@ -118,7 +119,17 @@ class World:
         for id_, call in self.made.items():
             if id_ not in self.ended:
                 boot = call.boot or "none"
-                self.caller.call(self.now, m.Call(id_, call.service, call.arguments, call.deadline, boot=boot))
+                self.caller.call(self.now, replace(call, boot=boot, again=True))
+
+    def flood(self, calls: int) -> None:
+        """Another client calls, under ids that have nothing in common. No CALL of ours is on its way for that long."""
+        self.stale.clear()
+        self.callee.link_up(self.now, "flood", m.Hello(1, 1, "client", "flood", "f1"))
+        for _ in range(calls):
+            id_ = f"flood {next(self.numbers)} flood"
+            assert self.callee.answer_inline(self.now, "flood", m.Call(id_, "flooded")) is not None
+            self.callee.keep(self.now, "flood", m.Outcome(id_, "success"))
+            self.callee.receive(self.now, "flood", m.ResultAck(id_))
 
     def pass_time(self, seconds: float, delay: float) -> None:
         end = self.now + seconds
@@ -178,7 +189,8 @@ class World:
 
     def _exchange(self, delay: float) -> None:
         due = self.now + delay
-        said, heard = self.caller.messages(self.now), [message for _, message in self.callee.messages()]
+        said = self.caller.messages(self.now)
+        heard = [message for peer, message in self.callee.messages() if peer == COORD]
         if not self.linked:
             return
         self.towards_node += [(due, message) for message in said]
@@ -204,6 +216,7 @@ OPERATIONS = st.one_of(
     st.tuples(st.just("connect")),
     st.tuples(st.just("cut"), st.integers(0, 5), st.booleans()),
     st.tuples(st.just("repeat"), st.integers(0, 50)),
+    st.tuples(st.just("flood"), st.sampled_from([1, 15])),
     st.tuples(st.just("reboot_node")),
     st.tuples(st.just("restart_coordinator")),
 )

@@ -140,7 +140,7 @@ def _call(**changes: Any) -> list[Any]:
     ("fields", "says"),
     [
         pytest.param([4, "c1"], "fields", id="too few fields"),
-        pytest.param([*CALL, 1], "fields", id="too many fields"),
+        pytest.param([*CALL, True, 1], "fields", id="too many fields"),
         pytest.param(_call(id=7), "id is a int", id="number for text"),
         pytest.param(_call(id=None), "id is a NoneType", id="nil for text"),
         pytest.param(_call(epoch=True), "epoch is a bool", id="bool for number"),
@@ -224,6 +224,12 @@ def test_the_quick_way_writes_what_the_table_writes(message: m.Message) -> None:
         by_table = encode(message)
     assert encode(message) == by_table
     assert decode(by_table) == message
+
+
+def test_a_call_made_again_has_one_field_more_and_any_other_none() -> None:
+    first, again = (m.Call("c1", "track", again=again) for again in (False, True))
+    assert encode(again) == b"\x9a" + encode(first)[1:] + b"\xc3" and encode(first)[0] == 0x99
+    assert (decode(encode(first)), decode(encode(again))) == (first, again)
 
 
 def test_a_provisional_result_has_one_field_more_and_any_other_none() -> None:

@@ -55,13 +55,14 @@ def test_the_codes_and_causes_are_the_codes() -> None:
 def test_the_times() -> None:
     assert (Timing().heartbeat, Timing().silence, Timing().handshake, Timing().user_timeout) == (0.25, 1.0, 2.0, 1.5)
     assert (Patience().reconnect, Patience().accept, Patience().stop) == (2.0, 1.0, 5.0)
-    assert (Keeping().results, Keeping().result_count, Keeping().ids, Keeping().lease) == (600.0, 1_000, 3_600.0, 2.0)
+    assert (Keeping().results, Keeping().result_count, Keeping().lease) == (600.0, 1_000, 2.0)
+    assert Keeping().id_groups == 100_000
     for said in (
         "after 0.25 s",
         "for 1.0 s",
         "there are 2 s",
         "(1.5 s)",
         "for 10 minutes (at most 1,000",
-        "for an hour",
+        "100,000 groups of 4,096",
     ):
         assert said in PAGE

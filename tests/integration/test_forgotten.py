@@ -1,0 +1,122 @@
+"""Real processes: a node that other clients' calls made forget a run does not run it again for a resumed coordinator."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import json
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from coordinator.record.journal import MAGIC, PREFIX, read_journal
+from coordinator.record.runfolder import JOURNAL
+from coordinator.task import Executed, Status
+from services.comm.caller import Caller
+from services.comm.client import Client
+from services.comm.directory import load
+from services.comm.messages import Call, Hello
+from services.comm.notice import Ended, Notice
+from services.comm.results import Keeping
+from tests.chaos.shuttle_cell import TASK, moves, shuttle_services
+from tests.integration.test_resume_processes import NEVER_BEGUN, PATIENCE, QUIET, ends_of, nodes, petrobot, until
+
+pytestmark = pytest.mark.processes
+RUNS = 4
+BATCH = 1_500
+"""Calls that are under way at once: more than the results that a node keeps, so that it drops those of the mission run."""
+
+
+async def _flood(port: int, ids: Callable[[int], str], calls: int) -> None:
+    """Another client makes so many calls, each answered."""
+    over, left = asyncio.Event(), 0
+
+    def count(_: float, notices: list[Notice]) -> None:
+        nonlocal left
+        left -= sum(isinstance(notice, Ended) for notice in notices)
+        if left <= 0:
+            over.set()
+
+    caller = Caller("flooded", Hello(1, 1, "client", "flood", "f1"), auto_ack=True)
+    client = Client("127.0.0.1", port, caller, on_notices=count)
+    client.start()
+    assert await client.connected(PATIENCE)
+    numbers = iter(range(1, calls + 1))
+    while batch := list(itertools.islice(numbers, BATCH)):
+        left = len(batch)
+        over.clear()
+        for number in batch:
+            caller.call(client.now(), Call(ids(number), "nowhere"))
+        client.flush()
+        async with asyncio.timeout(PATIENCE):
+            await over.wait()
+    await client.close()
+
+
+def _without_accepts(path: Path) -> None:
+    """Cut the journal before the first word of a node: so it is when the kill comes between an order and its ACCEPT."""
+    offset, raw = len(MAGIC), path.read_bytes()
+    for record in [None, *read_journal(path).records]:
+        if record is not None and record.data.get("stimulus", {}).get("kind") == "RunStarted":
+            path.write_bytes(raw[:offset])
+            return
+        offset += PREFIX.size + PREFIX.unpack_from(raw, offset)[0]
+    # The kill itself came between the two.
+
+
+@pytest.mark.parametrize("accepted", [True, False], ids=["accepted", "accept lost"])
+@pytest.mark.parametrize(
+    ("ids", "calls"),
+    [
+        pytest.param(lambda n: f"flood/{n}", 3_000, id="results"),
+        pytest.param(lambda n: f"flood/{n}", 202_500, id="counted ids", marks=pytest.mark.proof),
+        pytest.param(
+            lambda n: f"{n} flood", Keeping().id_groups + 2_500, id="ids without order", marks=pytest.mark.proof
+        ),
+    ],
+)
+def test_what_a_flood_made_its_node_forget_is_not_run_again(
+    tmp_path: Path, ids: Callable[[int], str], calls: int, accepted: bool
+) -> None:
+    services = shuttle_services(tmp_path, fetch=0.4, carry=0.4, orphan=60.0)
+    runs = tmp_path / "runs"
+    up = nodes(tmp_path)
+    try:
+        given = ["--services", str(services), "--runs", str(RUNS), "--journal", str(runs)]
+        process = petrobot(tmp_path, "run", str(TASK), *given, *QUIET)
+        until(lambda: len(moves(tmp_path, "begin")) >= 2, process)
+        process.send_signal(signal.SIGKILL)
+        assert process.wait(PATIENCE) == -signal.SIGKILL
+        [run] = runs.iterdir()
+        if not accepted:
+            _without_accepts(run / JOURNAL)
+        active = set(moves(tmp_path, "begin"))
+        until(
+            lambda: (
+                moves(tmp_path, "end").keys() >= {call for call in active if "tidy" not in call and "carry" not in call}
+            )
+        )
+        for node in load(services).nodes.values():
+            asyncio.run(_flood(node.port, ids, calls))
+        resumed = petrobot(tmp_path, "resume", str(run), "--json", str(tmp_path / "out.json"), *QUIET)
+        assert resumed.wait(PATIENCE) == 0, (tmp_path / "resume.txt").read_text()
+    finally:
+        up.terminate()
+        up.wait(PATIENCE)
+    assert json.loads((tmp_path / "out.json").read_text())["status"] == "success"
+    begun = moves(tmp_path, "begin")
+    assert set(begun.values()) == {1}, "executed twice"
+    assert not moves(tmp_path, "overlap")
+    ends = ends_of(tmp_path)
+    assert len(ends) == RUNS, "no token lost or doubled"
+    made = {call.rpartition("/")[2] for call in begun}
+    forgotten = [end for end in ends.values() if end.cause == "forgotten"]
+    assert forgotten, "the flood did what it was to do"
+    assert {(end.status, end.executed) for end in forgotten} <= {
+        (Status.ERROR, Executed.UNKNOWN),
+        (Status.SUCCESS, Executed.UNKNOWN),
+    }, "the second if the bell had preempted it"
+    for name, end in ends.items():
+        assert name in made or (end.status, end.executed) in NEVER_BEGUN, end
