@@ -27,6 +27,7 @@ from services.place import Place
 from services.remote import IN_EMERGENCY
 from services.worker import Setup
 from services.worker_place import START_LIMIT, WorkerPlace
+from services.worker_pool import WorkerPool
 
 
 class NodeShell:
@@ -68,13 +69,16 @@ class NodeShell:
         general = any(a.node == self._name and not a.device for a in self._directory.actions.values())
         return [*devices, GENERAL] if general else devices
 
-    def _worker_place(self, device: str) -> WorkerPlace:
-        return WorkerPlace(
-            replace(self._setup, device=device),
-            clock=self._loop.time,
-            changed=self._changed,
-            wanted=lambda stream: self._find_stream(device, stream),
-        )
+    def _worker_place(self, device: str) -> WorkerPlace | WorkerPool:
+        setup, clock = replace(self._setup, device=device), self._loop.time
+
+        def wanted(stream: str) -> None:
+            self._find_stream(device, stream)
+
+        if device == GENERAL:
+            most = self._directory.nodes[self._name].workers
+            return WorkerPool(setup, clock=clock, changed=self._changed, wanted=wanted, most=most)
+        return WorkerPlace(setup, clock=clock, changed=self._changed, wanted=wanted)
 
     # --- life --------------------------------------------------------------------------------------------------------
 

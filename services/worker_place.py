@@ -16,6 +16,7 @@ from typing import Any
 from services.action import Status
 from services.child import Child
 from services.comm.messages import Executed
+from services.device import PICTURE
 from services.device_process import HALT, LINKED
 from services.pipe import link_pair
 from services.remote import CLEAR_EMERGENCY, EMERGENCY_STOP
@@ -45,10 +46,12 @@ STABLE = 10.0
 START_LIMIT = 30.0
 """Seconds that a process has to become ready; then it is killed and started again."""
 NOT_READY = 10.0
-"""Seconds that a call waits for a process that is being started."""
+"""Seconds that a call waits for a process that could not be started; for one that is being started it waits `START_LIMIT`."""
 DRIVER_GONE = 0.25
 """Seconds before actions that have lost the link to their driver are started again: it has most likely died itself."""
 OUT_OF_MEMORY = "out_of_memory"
+DONE = {"hold": "held", "release": "released", CLEAR_EMERGENCY: "cleared", PICTURE: PICTURE}
+"""What actions without a device answer to a command when no process of theirs has anything to do; `stopped` to all others."""
 DRIVER_DIED = "the process of its device's driver died"
 
 
@@ -425,13 +428,17 @@ class WorkerPlace:
         if self._halt_due is not None and now >= self._halt_due:
             self._tell_lost("the device is not known to stand still")
         for id_, run in list(self._runs.items()):
-            if run.posted is None and now >= min(run.limit, run.taken + NOT_READY):
+            if run.posted is None and now >= self._wait_limit(run):
                 why = self.failed or self._died or "it is being started"
                 self._end(id_, "not_ready", f"its process is not ready: {why}")
             elif run.stop is None and now >= run.limit and self._frozen_since is None:
                 self._stop(now, run, Stop(id_, "deadline", f"not over after {run.begin.deadline:g} s"))
             elif run.stop is not None:
                 self._chase(now, run)
+
+    def _wait_limit(self, run: _Watched) -> float:
+        """Until when a run waits for its process."""
+        return min(run.limit, run.taken + (NOT_READY if self.failed else START_LIMIT))
 
     def _give_start_up(self, now: float) -> None:
         child = self._owner if self._stage is Stage.DRIVER_STARTS else self._worker
@@ -456,7 +463,7 @@ class WorkerPlace:
         times = [self._restart_at, self._halt_due, self._started + START_LIMIT if self._stage in STARTING else None]
         for run in self._runs.values():
             if run.posted is None:
-                times.append(min(run.limit, run.taken + NOT_READY))
+                times.append(self._wait_limit(run))
             elif run.stop is None:
                 times.append(run.limit if run.limit < math.inf and self._frozen_since is None else None)
             elif not run.killed:
@@ -495,8 +502,8 @@ class WorkerPlace:
     def _refuse(self, id_: str, verb: str) -> None:
         """No process can answer a command."""
         word, why = self.condition
-        holds = verb == "hold" and not self._setup.device
-        answer = word if verb == "status" else "held" if holds else "not ready"
+        done = "not ready" if self._setup.device else DONE.get(verb, "stopped")
+        answer = word if verb == "status" else done
         self._reports.append(Told(id_, answer, {"text": why, "runs": list(self._runs), "pids": self.pids()}))
 
     def _answer_commands(self) -> None:
@@ -536,6 +543,8 @@ class WorkerPlace:
         data, answer = {**told.data, "runs": list(self._runs), "pids": self.pids()}, told.answer
         if verb == "status":
             answer, data["text"] = self.condition
+            if answer == "up" and told.data.get("fenced"):
+                answer, data["text"] = "fenced", "the device is not known to stand still after an earlier run"
         self._reports.append(Told(told.id, answer, data))
 
     def stream_at(self, stream: str, host: str, port: int, ticket: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import os
 import random
 import select
@@ -15,10 +16,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from tests.node.test_processes import Nodes, Operator, operator_of, pids
+from tests.node.test_processes import ROOT, Nodes, Operator, operator_of, pids
 
 pytestmark = pytest.mark.processes
 RECOVERY = 60.0
@@ -121,3 +123,37 @@ async def test_a_device_outlives_two_hundred_kills_of_its_processes(tmp_path: Pa
     tally = await storm(tmp_path, 11, 240)
     print(tally.kills, tally.calls)
     assert not tally.wedged and sum(tally.kills.values()) >= 200, tally
+
+
+async def test_petrobot_nodes_says_up_only_when_a_call_would_be_taken(tmp_path: Path) -> None:
+    running = Nodes(tmp_path, "left")
+    try:
+        async with operator_of(running.directory, "left") as operator:
+            assert (await asyncio.to_thread(nodes_command, running.file))["left"]["up"]
+            driver = (await pids(operator, "left", "slide"))["driver"]
+            os.kill(driver, signal.SIGSTOP)
+            frozen = (await asyncio.to_thread(nodes_command, running.file))["left"]
+            assert (frozen["up"], frozen["not_ready"]) == (False, {"slide": "no answer"})
+            os.kill(driver, signal.SIGKILL)
+            seen = set()
+
+            async def up_again() -> bool:
+                left = (await asyncio.to_thread(nodes_command, running.file))["left"]
+                seen.update(left.get("not_ready", {}).values())
+                return bool(left["up"]) and (await pids(operator, "left", "slide"))["driver"] != driver
+
+            await operator.until(up_again, RECOVERY)
+            assert (await operator.call("go", to=0.0)).status == "success"
+            told = "restarting: the process of its driver died: it was ended by SIGKILL"
+            assert seen <= {told, "no answer", "not ready: " + told.partition(": ")[2]}, seen
+    finally:
+        running.stop()
+
+
+def nodes_command(file: Path) -> dict[str, Any]:
+    """What `petrobot nodes` says."""
+    command = [sys.executable, "-m", "coordinator", "nodes", "--services", str(file), "--json", "-"]
+    said = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=RECOVERY)
+    answers: dict[str, Any] = json.loads(said.stdout)
+    assert said.returncode == (0 if all(answer["up"] for answer in answers.values()) else 3), said.stderr
+    return {name: answer for name, answer in answers.items() if name == "left"}
