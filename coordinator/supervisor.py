@@ -9,13 +9,16 @@ import functools
 import os
 import signal
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import BinaryIO
 
 PR_SET_PDEATHSIG = 1  # prctl(2): a child ends with its parent, also when that is killed
 FIRST_PAUSE = 0.25
 LONGEST_PAUSE = 8.0
+LAST_WORDS = 0.5  # for the rest of what an ended program has said (s); what it has left running may never stop talking
 STABLE_AFTER = 10.0  # a node that ran so long (s) starts again without pause
 
 
@@ -161,23 +164,51 @@ class Supervisor:
     async def _run_once(self, child: _Child) -> None:
         with child.log.open("ab") as log:
             child.begun_at = log.seek(0, os.SEEK_END)
-            process = await asyncio.create_subprocess_exec(
-                *child.program.command,
-                stdin=asyncio.subprocess.DEVNULL,
-                stdout=asyncio.subprocess.PIPE,
-                stderr=log,
-                preexec_fn=functools.partial(_end_with, os.getpid()),
-            )
-            child.process, child.starts = process, child.starts + 1
-            if self._stopping:
-                _signal(child, signal.SIGTERM)
-            assert process.stdout is not None
-            async for line in process.stdout:
-                log.write(line)
-                log.flush()
-                if b"ready" in line:
-                    child.ready.set()
-            await process.wait()
+            async with output_pipe() as (end, output):
+                process = await asyncio.create_subprocess_exec(
+                    *child.program.command,
+                    stdin=asyncio.subprocess.DEVNULL,
+                    stdout=end,
+                    stderr=log,
+                    preexec_fn=functools.partial(_end_with, os.getpid()),
+                )
+                end.close()
+                child.process, child.starts = process, child.starts + 1
+                if self._stopping:
+                    _signal(child, signal.SIGTERM)
+                copying = asyncio.create_task(_copy(child, output, log))
+                await process.wait()
+                await asyncio.wait({copying}, timeout=LAST_WORDS)
+                copying.cancel()
+
+
+@asynccontextmanager
+async def output_pipe(limit: int = 1 << 16) -> AsyncIterator[tuple[BinaryIO, asyncio.StreamReader]]:
+    """A pipe for the output of a child: the end to pass to it, to be closed once it is started, and what comes out.
+
+    A pipe of asyncio's own (`stdout=PIPE`) would be part of the process: `wait` would then wait for the end of the pipe, which
+    whatever the child has left running may hold open for ever.
+    """
+    reading, writing = os.pipe()
+    reader = asyncio.StreamReader(limit)
+    connected = asyncio.get_running_loop().connect_read_pipe(
+        lambda: asyncio.StreamReaderProtocol(reader), os.fdopen(reading, "rb", 0)
+    )
+    transport, _ = await connected
+    with os.fdopen(writing, "wb", 0) as end:
+        try:
+            yield end, reader
+        finally:
+            transport.close()
+
+
+async def _copy(child: _Child, output: asyncio.StreamReader, log: BinaryIO) -> None:
+    """Write what a program says to its log; it is ready when it says so."""
+    async for line in output:
+        log.write(line)
+        log.flush()
+        if b"ready" in line:
+            child.ready.set()
 
 
 def _signal(child: _Child, number: signal.Signals) -> None:

@@ -1,9 +1,13 @@
-"""One child process of a node and the pipe to it, in the node's asyncio loop."""
+"""One child process of a node and the pipe to it, in the node's asyncio loop.
+
+Its end is that of the process, never that of the pipe: what user code has left running may hold the pipe open, or close it.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import signal
 import socket
 import subprocess
@@ -11,20 +15,29 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
+from services.comm.parentage import STOP_ROUTINE, until_ended
+from services.keeper import KILL_ORDER
 from services.pipe import pipe_pair
-from services.worker import Setup
+from services.worker import BORN, Setup
 
 NONE = -1
+LEAVE_LIMIT = 4.0
+"""Seconds that a process has to end in good order."""
+PIPE_LIMIT = 0.5
+"""Seconds after the end of its pipe when a process is killed: the node can neither order nor hear anything any more."""
+KEEPER_LIMIT = 3.0
+"""Seconds that a keeper has to carry out the order to kill; then it is killed itself, and its worker by the kernel."""
 
 
 class Child:
-    """A running process of `services.worker`. `heard(items)` gets each list that it sends, `ended()` that it is gone."""
+    """A running process of `services.worker` under its keeper. `heard(child, items)` receives each list that it sends;
+    `ended(child)` is called once, when neither it nor anything that it has started runs any more."""
 
     def __init__(
         self,
         setup: Setup,
-        heard: Callable[[list[Any]], None],
-        ended: Callable[[], None],
+        heard: Callable[[Child, list[Any]], None],
+        ended: Callable[[Child], None],
         link: socket.socket | None = None,
     ) -> None:
         """Start it; `link` is the worker's end of the link to its device, closed here. Raises OSError when that fails."""
@@ -35,22 +48,44 @@ class Child:
         self._descriptors, descriptors_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         passed = [pipe_end, descriptors_end, *([link] if link else [])]
         numbers = [pipe_end.fileno(), descriptors_end.fileno(), link.fileno() if link else NONE]
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "services.worker", *map(str, numbers)],
-            pass_fds=[end.fileno() for end in passed],
-            stdin=subprocess.DEVNULL,
-            start_new_session=True,  # a Ctrl-C in the node's terminal is for the node: it ends its children in order
-        )
-        for end in passed:
-            end.close()
+        # Only what owns a device has something to do after the node's end: its stop routine.
+        patience = int(STOP_ROUTINE) if setup.device and link is None else 0
+        try:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "services.keeper", *map(str, (os.getpid(), patience, *numbers))],
+                pass_fds=[end.fileno() for end in passed],
+                stdin=subprocess.DEVNULL,
+                start_new_session=True,  # a Ctrl-C in the node's terminal is for the node: it ends its children in order
+            )
+        except OSError:
+            self.pipe.close()
+            self._descriptors.close()
+            raise
+        finally:
+            for end in passed:
+                end.close()
+        self._worker = 0
+        self._killed = ""
+        self._let_go = False
+        self._limits: list[asyncio.TimerHandle] = []
         self.pipe.post([dict(setup.items())])
         self._loop.add_reader(self.pipe.socket, self._read)
-        self._gone = False
+        self._watch = self._loop.create_task(self._wait_for_end())
 
     @property
     def pid(self) -> int:
-        """Its process id."""
-        return self.process.pid
+        """Process id of the worker; until it has said so, that of its keeper."""
+        return self._worker or self.process.pid
+
+    @property
+    def closed(self) -> bool:
+        """Whether it can be ordered nothing any more: its pipe has ended."""
+        return self.pipe.closed
+
+    @property
+    def code(self) -> int | None:
+        """Its exit code, minus the number of the signal that ended it, None while it runs."""
+        return self.process.poll()
 
     def post(self, items: list[Any]) -> None:
         """Send it a list; what does not fit now is sent when it reads."""
@@ -65,66 +100,78 @@ class Child:
 
     def pass_link(self, end: socket.socket, word: str) -> None:
         """Pass it an end of a socket, and tell it so; the end is closed here."""
-        with contextlib.suppress(BrokenPipeError):
+        with contextlib.suppress(OSError):
             socket.send_fds(self._descriptors, [b"."], [end.fileno()])
         end.close()
         self.post([word])
 
-    def kill(self) -> None:
-        """End it at once (SIGKILL)."""
-        with contextlib.suppress(ProcessLookupError):
-            self.process.send_signal(signal.SIGKILL)
+    def kill(self, why: str = "") -> None:
+        """End it at once, and all that it has started."""
+        if self.process.poll() is None:
+            self._killed = self._killed or why
+            self.process.send_signal(KILL_ORDER)
+            self._limit(KEEPER_LIMIT, self.process.kill)
 
     def leave(self) -> None:
-        """Let it end in good order: its pipe closes, so that it stops its device and leaves."""
-        if not self._gone:
-            self._forget()
+        """Let it end in good order: its pipe closes, so that it stops its device and leaves. Killed after `LEAVE_LIMIT`."""
+        if not self._let_go:
+            self._close_pipe()
+            self._limit(LEAVE_LIMIT, self.kill)
 
-    async def wait(self, timeout: float) -> None:
-        """Wait until it has ended; kill it when it has not after `timeout` seconds."""
-        until = self._loop.time() + timeout
-        while self.process.poll() is None and self._loop.time() < until:
-            await asyncio.sleep(0.005)
-        if self.process.poll() is None:
-            self.kill()
-            await asyncio.to_thread(self.process.wait)
-        self._close()
+    async def wait(self) -> None:
+        """Wait until it has ended."""
+        await self._watch
 
     def describe(self) -> str:
         """How it ended, for people."""
         code = self.process.poll()
-        if code is None:
-            return "it closed its pipe"
+        if self._killed or code is None:
+            return self._killed or "it closed its pipe"
         if code >= 0:
             return f"it exited with code {code}"
         name = signal.Signals(-code).name if -code in set(signal.Signals) else str(-code)
         return f"it was ended by {name}"
 
+    def _limit(self, seconds: float, act: Callable[[], None]) -> None:
+        self._limits.append(self._loop.call_later(seconds, act))
+
     def _read(self) -> None:
-        for items in self.pipe.read():
-            self._heard(items)
-        if self.pipe.closed and not self._gone:
-            self._forget()
-            self._reap(0)
+        try:
+            received = self.pipe.read()
+        except ValueError:
+            received = []
+            self._close_pipe()
+            self.kill("it wrote into its pipe what is no record, and was killed")
+        for items in received:
+            if items and items[0] == BORN:
+                self._worker = items[1]
+            else:
+                self._heard(self, items)
+        if self.pipe.closed and not self._let_go:
+            self._close_pipe()
+            self._limit(PIPE_LIMIT, lambda: self.kill("it closed its pipe, and was killed"))
 
-    def _reap(self, tries: int) -> None:
-        """Its pipe is closed; it is dead or about to be."""
-        if self.process.poll() is None and tries < 100:
-            if tries == 20:
-                self.kill()
-            self._loop.call_later(0.002, self._reap, tries + 1)
-            return
-        self._close()
-        self._ended()
-
-    def _close(self) -> None:
-        self._forget()
+    async def _wait_for_end(self) -> None:
+        await until_ended(self.process.pid)
+        self.process.wait()
+        for limit in self._limits:
+            limit.cancel()
+        if not self._let_go:
+            self._read()  # its last words
+            self._close_pipe()
+        for limit in self._limits:
+            limit.cancel()
+        if self._worker:
+            # It has ended before its keeper, unless that was killed: then it ends now, as the kernel sees to.
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(LEAVE_LIMIT):
+                    await until_ended(self._worker)
         self._descriptors.close()
+        self._ended(self)
 
-    def _forget(self) -> None:
-        """Let the pipe go; nothing is heard any more."""
-        self._gone = True
-        if self.pipe.socket.fileno() >= 0:
+    def _close_pipe(self) -> None:
+        if not self._let_go:
+            self._let_go = True
             self._loop.remove_reader(self.pipe.socket)
             self._loop.remove_writer(self.pipe.socket)
-        self.pipe.close()
+            self.pipe.close()

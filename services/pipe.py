@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import os
 import socket
+import weakref
 from typing import Any
 
 import msgpack
@@ -13,14 +15,45 @@ LARGEST = 64 << 20
 """Most bytes of one record, and of what waits to be read."""
 CHUNK = 1 << 18
 
+_ENDS: weakref.WeakSet[socket.socket] = weakref.WeakSet()
+"""Sockets of this process that none that it forks may hold: the other side would take it for this one."""
+
+
+class _Copy:
+    """Whether this process is one that a worker has forked."""
+
+    made = False
+
+
+def keep_from_copies(*ends: socket.socket) -> None:
+    """From now on these sockets, and all pipes and links of this process, are closed in every process that it forks or executes.
+
+    A copy that comes back from the action that forked it, and uses the pipe to the node, ends there: two processes must not
+    both serve one run, nor both stop one device.
+    """
+    _ENDS.update(ends)
+    for end in _ENDS:
+        os.set_inheritable(end.fileno(), False)
+    os.register_at_fork(after_in_child=_become_copy)
+
+
+def _become_copy() -> None:
+    _Copy.made = True
+    for end in list(_ENDS):
+        end.close()
+
 
 class Pipe:
-    """One end. `post` takes a list and sends what fits; `read` gives whole lists. `closed` once the other end is gone."""
+    """One end. `post` takes a list and sends what fits; `read` gives whole lists. `closed` once the other end is gone; what it
+    has sent before can still be read."""
 
     def __init__(self, end: socket.socket) -> None:
         end.setblocking(False)
+        _ENDS.add(end)
         self.socket = end
         self.closed = False
+        self._ended = False
+        """Whether everything has been read."""
         self._unsent = bytearray()
         self._packer = msgpack.Packer()
         self._unpacker = msgpack.Unpacker(max_buffer_size=LARGEST)
@@ -36,8 +69,10 @@ class Pipe:
 
     def post(self, items: list[Any]) -> None:
         """Send a list, or keep what does not fit for `flush`."""
-        self._unsent += self._packer.pack(items)
-        self.flush()
+        self._end_copy()
+        if not self.closed:
+            self._unsent += self._packer.pack(items)
+            self.flush()
 
     def flush(self) -> None:
         """Send what waits, as much as fits."""
@@ -45,26 +80,43 @@ class Pipe:
             while self._unsent and not self.closed:
                 try:
                     del self._unsent[: self.socket.send(self._unsent)]
-                except (BrokenPipeError, ConnectionResetError):
+                except BlockingIOError:
+                    raise
+                except OSError:  # the other end is gone, or user code has closed this one
                     self.closed = True
+                    self._unsent.clear()
 
     def read(self) -> list[list[Any]]:
-        """All lists that have come."""
+        """All lists that have come. Raises ValueError for what is not msgpack: user code has written into the pipe."""
+        self._end_copy()
         with contextlib.suppress(BlockingIOError):
-            while not self.closed:
+            while not self._ended:
                 try:
                     data = self.socket.recv(CHUNK)
-                except ConnectionResetError:
+                except BlockingIOError:
+                    raise
+                except OSError:
                     data = b""
                 if not data:
-                    self.closed = True
+                    self.closed = self._ended = True
                     break
-                self._unpacker.feed(data)
+                self._feed(data)
         return [item for item in self._unpacker if isinstance(item, list)]
+
+    def _feed(self, data: bytes) -> None:
+        try:
+            self._unpacker.feed(data)
+        except msgpack.BufferFull as fault:
+            raise ValueError(f"a record of more than {LARGEST} bytes") from fault
+
+    @staticmethod
+    def _end_copy() -> None:
+        if _Copy.made:
+            os._exit(0)
 
     def close(self) -> None:
         """Let it go."""
-        self.closed = True
+        self.closed = self._ended = True
         self.socket.close()
 
 
@@ -73,6 +125,7 @@ class NewestLink:
 
     def __init__(self, end: socket.socket) -> None:
         end.setblocking(False)
+        _ENDS.add(end)
         self.socket = end
         self.closed = False
 

@@ -94,7 +94,10 @@ class InlinePlace:
 
     def take(self, now: float, order: Order) -> None:
         """Take an order about a run."""
+        held = self._runner.held and bool(self._runner.runs)
         self._runner.take(now, order)
+        if held and not self._runner.runs:
+            self._carry_out(now, "release")  # what was held was stopped before it began
 
     def command(self, now: float, id: str, verb: str) -> None:  # noqa: A002
         """Carry out an operator's command at once."""
@@ -114,7 +117,7 @@ class InlinePlace:
             return "released", {}
         if verb in ("stop", EMERGENCY_STOP):
             for run in self._runner.runs:
-                self._runner.take(now, Stop(run, "stopped" if verb == "stop" else verb, "by command"))
+                self.take(now, Stop(run, "stopped" if verb == "stop" else verb, "by command"))
             self._stop_driver(now, verb)
             return "stopped" if driver is None or driver.stopped() else "stopping", {}
         if verb == CLEAR_EMERGENCY:

@@ -215,7 +215,8 @@ class Runner:
         except _FAULTS as fault:
             run.close()
             if run.phase is not Phase.STOPPING:
-                self._give_up(now, run, "exception", describe(fault))
+                cause = "out_of_memory" if isinstance(fault, MemoryError) else "exception"
+                self._give_up(now, run, cause, describe(fault))
             elif not isinstance(fault, Cancelled):
                 run.note(f"while it cleaned up: {describe(fault)}")
         if run.phase is Phase.STOPPING and run.over:

@@ -26,12 +26,8 @@ from services.node import GENERAL, Node, stream_service
 from services.place import Place
 from services.remote import IN_EMERGENCY
 from services.worker import Setup
-from services.worker_place import WorkerPlace
-
-START_LIMIT = 30.0
-"""Seconds that the devices have to come up."""
-LEAVE_LIMIT = 4.0
-"""Seconds that the processes have to end in good order."""
+from services.worker_place import START_LIMIT, WorkerPlace
+from services.worker_pool import WorkerPool
 
 
 class NodeShell:
@@ -43,7 +39,7 @@ class NodeShell:
         self._name = name
         self._loop = asyncio.get_running_loop()
         self._tickets = _tickets(directory, name)
-        self._setup = Setup(str(directory.source), text, name, "", mock, memory, os.getpid(), self._tickets)
+        self._setup = Setup(str(directory.source), text, name, "", mock, memory, self._tickets)
         self._credentials = credentials(directory, name)
         self._workers = {device: self._worker_place(device) for device in self._devices()}
         places: dict[str, Place] = {**self._workers}
@@ -73,13 +69,16 @@ class NodeShell:
         general = any(a.node == self._name and not a.device for a in self._directory.actions.values())
         return [*devices, GENERAL] if general else devices
 
-    def _worker_place(self, device: str) -> WorkerPlace:
-        return WorkerPlace(
-            replace(self._setup, device=device),
-            clock=self._loop.time,
-            changed=self._changed,
-            wanted=lambda stream: self._find_stream(device, stream),
-        )
+    def _worker_place(self, device: str) -> WorkerPlace | WorkerPool:
+        setup, clock = replace(self._setup, device=device), self._loop.time
+
+        def wanted(stream: str) -> None:
+            self._find_stream(device, stream)
+
+        if device == GENERAL:
+            most = self._directory.nodes[self._name].workers
+            return WorkerPool(setup, clock=clock, changed=self._changed, wanted=wanted, most=most)
+        return WorkerPlace(setup, clock=clock, changed=self._changed, wanted=wanted)
 
     # --- life --------------------------------------------------------------------------------------------------------
 
@@ -125,7 +124,7 @@ class NodeShell:
         self._serving = False
         await self.server.close()
         children = [child for place in self._workers.values() for child in place.children()]
-        await asyncio.gather(*(child.wait(LEAVE_LIMIT) for child in children))
+        await asyncio.gather(*(child.wait() for child in children))
         self._cancel_timers()
 
     def _cancel_timers(self) -> None:

@@ -1,12 +1,12 @@
 """A process of a node: the warm worker that runs the actions of a device (or of none), or the process of a cyclic driver.
 
-Started by its node as `python -m services.worker PIPE DESCRIPTORS LINK` with the numbers of inherited sockets (-1: none). The
-node says over the pipe which it is to be. A process that makes its device's driver and finds it cyclic serves the driver alone.
+Forked by its keeper (`services/keeper.py`) with the numbers of the inherited sockets PIPE DESCRIPTORS LINK (-1: none). The node
+says over the pipe which it is to be. A process that makes its device's driver and finds it cyclic serves the driver alone.
 """
 
 from __future__ import annotations
 
-import contextlib
+import os
 import resource
 import select
 import selectors
@@ -20,11 +20,11 @@ from pathlib import Path
 from typing import Any
 
 from services.comm.directory import Directory, DirectoryError, parse
-from services.comm.parentage import STOP_ROUTINE, die_with, outlive
+from services.comm.parentage import STOP_ROUTINE, outlive
 from services.device import Driver
 from services.device_process import DeviceLoop, take_priority
 from services.drivers import make_driver
-from services.pipe import NewestLink, Pipe
+from services.pipe import NewestLink, Pipe, keep_from_copies
 from services.place import InlinePlace
 from services.ports import ProcessPorts
 from services.remote import DeviceCommand, DeviceState, RemoteDriver
@@ -34,8 +34,13 @@ from services.stream_outlets import StreamOutlets
 
 POLL = 0.002
 """Seconds between looks at what a run waits for, when it is more than time."""
-READY, FAILED, COMMAND, PING, PONG = "ready", "failed", "command", "ping", "pong"
+BORN, READY, FAILED, COMMAND, PING, PONG = "born", "ready", "failed", "command", "ping", "pong"
 WANTED, STREAM_AT = "wanted", "stream_at"
+LINK_LOST, NO_MEMORY = 90, 91
+"""Exit codes: the driver's process is gone; not even the report of a run fits into the memory that is left."""
+
+
+_IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +56,6 @@ class Setup:
     mock: str = ""
     memory: int = 0
     """Limit of the address space (bytes), 0 for none."""
-    parent: int = 0
-    """Process id of the node."""
     tickets: Mapping[str, str] = field(default_factory=dict)
     """What opens each stream that this node receives."""
 
@@ -162,7 +165,7 @@ class Worker:
             self._remote.take(DeviceState(*items))
         if link.closed:
             # Without its driver nothing here can be done; the node starts both again.
-            sys.exit(0)
+            os._exit(LINK_LOST)
 
     def _post_command(self, command: DeviceCommand) -> None:
         assert self._link is not None
@@ -181,11 +184,10 @@ def _first(node: Pipe) -> Setup:
 
 def serve(node: Pipe, descriptors: socket.socket | None, link: NewestLink | None) -> None:
     """Be what the node says. Faults of the driver go back to it as text."""
+    node.post([BORN, os.getpid()])
     setup = _first(node)
     if link is None and setup.device:
-        outlive(setup.parent, STOP_ROUTINE)
-    else:
-        die_with(setup.parent)
+        outlive(os.getppid(), STOP_ROUTINE)
     if setup.memory:
         resource.setrlimit(resource.RLIMIT_AS, (setup.memory, setup.memory))
     try:
@@ -210,14 +212,21 @@ def serve(node: Pipe, descriptors: socket.socket | None, link: NewestLink | None
 
 
 def main(arguments: list[str]) -> None:
-    """Entry point of the process."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)  # the node decides when its children end
-    pipe, descriptors, link = (int(a) for a in arguments)
-    end = socket.socket(fileno=descriptors) if descriptors >= 0 else None
-    with contextlib.suppress(BrokenPipeError):
-        serve(Pipe(socket.socket(fileno=pipe)), end, NewestLink(socket.socket(fileno=link)) if link >= 0 else None)
+    """What the process does, once it is forked."""
+    for number in _IGNORED:
+        # The node decides when its children end. A handler, unlike SIG_IGN, is not passed on to programs that user code starts.
+        signal.signal(number, lambda *_: None)
+    os.register_at_fork(after_in_child=_take_signals)
+    pipe, descriptors, link = (socket.socket(fileno=int(a)) if int(a) >= 0 else None for a in arguments)
+    assert pipe is not None
+    node, driver_link = Pipe(pipe), NewestLink(link) if link is not None else None
+    keep_from_copies(*([descriptors] if descriptors is not None else []))
+    try:
+        serve(node, descriptors, driver_link)
+    except MemoryError:
+        os._exit(NO_MEMORY)
 
 
-if __name__ == "__main__":
-    main(sys.argv[1:])
+def _take_signals() -> None:
+    for number in _IGNORED:
+        signal.signal(number, signal.SIG_DFL)

@@ -1,4 +1,4 @@
-"""Where the runs of one device (or of none) take place in real time: in processes of their own, watched by the node.
+"""Where the runs of one device (or runs of none) take place in real time: in processes of their own, watched by the node.
 
 A device without cyclic duty has one process, which owns its driver and runs its actions. A cyclic device has two: its driver's,
 and its actions'. A run that hangs is ended at its deadline (stop routine first, then its process is killed), one whose process
@@ -10,28 +10,92 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from enum import Enum
 from typing import Any
 
 from services.action import Status
 from services.child import Child
 from services.comm.messages import Executed
+from services.device import PICTURE
 from services.device_process import HALT, LINKED
 from services.pipe import link_pair
 from services.remote import CLEAR_EMERGENCY, EMERGENCY_STOP
 from services.runner import GRACE, STOP_LIMIT
 from services.runs import Begin, Ended, Hold, Order, Report, Stop, Told, flat, record
-from services.worker import COMMAND, FAILED, PING, PONG, READY, STREAM_AT, WANTED, Setup
+from services.worker import (
+    COMMAND,
+    FAILED,
+    LINK_LOST,
+    NO_MEMORY,
+    PING,
+    PONG,
+    READY,
+    STREAM_AT,
+    WANTED,
+    Setup,
+)
 
 SILENT = 0.1
 """Seconds without an answer after which a worker counts as hanging, so that its device is stopped without it."""
 MARGIN = 0.5
 """Seconds beyond grace and stop limit after which a worker that answers but does not end a run is killed all the same."""
 PAUSES = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-"""Seconds before a dead process is started again, by how often it died soon after its start."""
+"""Seconds before a dead process is started again, by how often it died soon after its start without ending a run."""
 STABLE = 10.0
 """Seconds after which a process counts as well started."""
+START_LIMIT = 30.0
+"""Seconds that a process has to become ready; then it is killed and started again."""
 NOT_READY = 10.0
-"""Seconds that a call waits for a process that is being started."""
+"""Seconds that a call waits for a process that could not be started; for one that is being started it waits `START_LIMIT`."""
+DRIVER_GONE = 0.25
+"""Seconds before actions that have lost the link to their driver are started again: it has most likely died itself."""
+OUT_OF_MEMORY = "out_of_memory"
+DONE = {"hold": "held", "release": "released", CLEAR_EMERGENCY: "cleared", PICTURE: PICTURE}
+"""What actions without a device answer to a command when no process of theirs has anything to do; `stopped` to all others."""
+DRIVER_DIED = "the process of its device's driver died"
+
+
+class Stage(Enum):
+    """Which processes of a place there are, and what they wait for."""
+
+    DOWN = "none runs; the first is started when its pause is over"
+    DRIVER_STARTS = "the process with the device's driver was started and is not ready"
+    ACTIONS_DOWN = "a cyclic driver is ready, its actions' process is started when its pause is over"
+    ACTIONS_START = "the process of the actions was started and is not ready; a cyclic driver is"
+    READY = "runs are taken"
+    CLOSED = "the node ends; nothing is started any more"
+
+
+class Happening(Enum):
+    """What moves a place from one stage to the next."""
+
+    START_DRIVER = "a process for the device's driver was started"
+    START_ACTIONS = "a process for actions alone was started"
+    DRIVER_READY = "a cyclic driver is ready"
+    READY = "the process that runs the actions is ready"
+    ACTIONS_ENDED = "the process of a cyclic device's actions has ended"
+    ALL_ENDED = "the process with the driver has ended, or the only one"
+    CLOSE = "the node ends"
+
+
+NEXT: Mapping[tuple[Stage, Happening], Stage] = {
+    (Stage.DOWN, Happening.START_DRIVER): Stage.DRIVER_STARTS,
+    (Stage.DOWN, Happening.START_ACTIONS): Stage.ACTIONS_START,
+    (Stage.DRIVER_STARTS, Happening.DRIVER_READY): Stage.ACTIONS_DOWN,
+    (Stage.DRIVER_STARTS, Happening.READY): Stage.READY,
+    (Stage.DRIVER_STARTS, Happening.ALL_ENDED): Stage.DOWN,
+    (Stage.ACTIONS_DOWN, Happening.START_ACTIONS): Stage.ACTIONS_START,
+    (Stage.ACTIONS_DOWN, Happening.ALL_ENDED): Stage.DOWN,
+    (Stage.ACTIONS_START, Happening.READY): Stage.READY,
+    (Stage.ACTIONS_START, Happening.ACTIONS_ENDED): Stage.ACTIONS_DOWN,
+    (Stage.ACTIONS_START, Happening.ALL_ENDED): Stage.DOWN,
+    (Stage.READY, Happening.ACTIONS_ENDED): Stage.ACTIONS_DOWN,
+    (Stage.READY, Happening.ALL_ENDED): Stage.DOWN,
+    **{(stage, Happening.CLOSE): Stage.CLOSED for stage in Stage},
+}
+"""Every move. What is not in the table happens only out of turn (a second READY) and moves nothing."""
+
+STARTING = (Stage.DRIVER_STARTS, Stage.ACTIONS_START)
 
 
 @dataclass
@@ -51,7 +115,7 @@ class _Watched:
     killed: bool = False
 
 
-Spawn = Callable[[Setup, Callable[[list[Any]], None], Callable[[], None], Any], Child]
+Spawn = Callable[[Setup, Callable[[Child, list[Any]], None], Callable[[Child], None], Any], Child]
 
 
 class WorkerPlace:
@@ -71,39 +135,65 @@ class WorkerPlace:
         self._changed = changed
         self._wanted = wanted
         self._spawn = spawn
+        self._stage = Stage.DOWN
         self._owner: Child | None = None
         """Process of the device's driver; None without a device."""
         self._worker: Child | None = None
         """Process of the actions: the owner itself, unless the driver is cyclic."""
-        self._ready = False
-        self._cyclic = False
         self.streams: Mapping[str, int] = {}
         """Port at which each stream is received."""
         self.failed = ""
-        """Why the device could not be started, empty if it could."""
+        """Why a process could not be started, empty if it could."""
+        self._died = ""
+        """How the last process ended; empty once the place is ready again."""
         self._runs: dict[str, _Watched] = {}
         self._lost: list[Ended] = []
         """Ends that are told when the device is known to stand still."""
         self._halt_due: float | None = None
         self._halts = 0
         self._pings = 0
-        self._holds: set[str] = set()
-        """Orders to hold that have not been answered."""
+        self._commands: dict[str, str] = {}
+        """Verb of each command that a process has not answered."""
         self._frozen_since: float | None = None
         self._reports: list[Report] = []
         self._deaths = 0
         self._started = -math.inf
         self._restart_at: float | None = None
-        self._closing = False
+        self._retiring: Child | None = None
+        """A process that was told to leave for lack of memory."""
         self._emergency = False
         """Whether the device obeys nobody until that is cleared: its next process, too, is told at once."""
 
     # --- processes ---------------------------------------------------------------------------------------------------
 
     @property
+    def stage(self) -> Stage:
+        """Which processes there are."""
+        return self._stage
+
+    @property
     def ready(self) -> bool:
-        """Whether its processes are up."""
-        return self._ready
+        """Whether a run would be taken at once: its processes are up, and none of them is known to end."""
+        return self._stage is Stage.READY and self._takes_orders()
+
+    def _takes_orders(self) -> bool:
+        return self._worker is not None and not self._worker.closed and not (self._owner and self._owner.closed)
+
+    @property
+    def condition(self) -> tuple[str, str]:
+        """`up` if a run would be taken, else `starting`, `restarting` or `failed`; and why, empty for the first two."""
+        if self.ready:
+            return "up", ""
+        if self.failed:
+            return "failed", self.failed
+        if self._died or self._deaths or self._stage is Stage.READY:
+            return "restarting", self._died or "one of its processes is ending"
+        return "starting", ""
+
+    @property
+    def runs(self) -> tuple[str, ...]:
+        """Ids of the runs that it has taken and that have not ended."""
+        return (*self._runs, *(end.id for end in self._lost))
 
     def pids(self) -> dict[str, int]:
         """Process ids: `actions`, and `driver` when that has a process of its own."""
@@ -115,49 +205,53 @@ class WorkerPlace:
         return found
 
     def start(self) -> None:
-        """Start what is not running."""
+        """Start the first process, unless there is one."""
+        if self._stage is Stage.DOWN:
+            self._start_due()
+
+    def _start_due(self) -> None:
+        """Start the process that is missing in this stage."""
         self._started, self._restart_at = self._clock(), None
-        if self._setup.device and self._owner is None:
-            self._owner = self._spawn(self._setup, self._heard_owner, self._owner_ended, None)
-        elif self._worker is None:
-            self._start_worker()
+        try:
+            if self._setup.device and self._stage is Stage.DOWN:
+                self._owner = self._spawn(self._setup, self._heard, self._ended, None)
+                self._move(Happening.START_DRIVER)
+            else:
+                self._start_worker()
+                self._move(Happening.START_ACTIONS)
+        except OSError as fault:
+            self.failed = f"its process could not be started: {fault}"
+            self._plan_restart()
 
     def _start_worker(self) -> None:
         link = None
         if self._owner is not None:
             link, far = link_pair()
             self._owner.pass_link(far, LINKED)
-        self._worker = self._spawn(self._setup, self._heard_worker, self._worker_ended, link)
+        self._worker = self._spawn(self._setup, self._heard, self._ended, link)
 
-    def _heard_owner(self, items: list[Any]) -> None:
-        if items[0] == READY and items[1]["period"]:
-            self._cyclic, self.streams = True, items[1]["streams"]
-            if self._emergency and self._owner is not None:
-                self._owner.post([COMMAND, EMERGENCY_STOP, EMERGENCY_STOP])
-            self._start_worker()
-        elif items[0] == READY:
-            self._worker, self.streams = self._owner, items[1]["streams"]
-            self._become_ready()
-        else:
-            self._heard(items)
-        self._changed()
+    def _move(self, happening: Happening) -> bool:
+        """Go to the next stage. False if this comes out of turn, and moves nothing."""
+        stage = NEXT.get((self._stage, happening))
+        if stage is None:
+            return False
+        self._stage = stage
+        return True
 
-    def _heard_worker(self, items: list[Any]) -> None:
+    def _heard(self, child: Child, items: list[Any]) -> None:
+        """A process of this place says something; what a former one has said last counts no more."""
+        if child is self._owner or child is self._worker:
+            try:
+                self._take_words(child, items)
+            except (ValueError, TypeError, IndexError, KeyError, AttributeError):
+                child.kill("it wrote into its pipe what is no record, and was killed")  # user code did, or a copy of it
+            self._changed()
+
+    def _take_words(self, child: Child, items: list[Any]) -> None:
         if items[0] == READY:
-            self._become_ready()
-        else:
-            self._heard(items)
-        self._changed()
-
-    def _become_ready(self) -> None:
-        self._ready, self.failed = True, ""
-        for run in self._runs.values():
-            if run.posted is None:
-                self._post_begin(self._clock(), run)
-
-    def _heard(self, items: list[Any]) -> None:
-        if items[0] == FAILED:
-            self.failed = items[1]
+            self._take_ready(child, items[1])
+        elif items[0] == FAILED:
+            self.failed = str(items[1])
         elif items[0] == PONG:
             for run in self._runs.values():
                 run.pong = run.pong or run.stop is not None
@@ -166,48 +260,109 @@ class WorkerPlace:
         else:
             report = record(items)
             if isinstance(report, Ended):
-                if self._runs.pop(report.id, None) is not None:
-                    self._reports.append(report)
-                    self._release_if_over()
+                self._take_end(report)
             elif isinstance(report, Told):
                 self._told(report)
             else:
                 self._reports.append(report)  # type: ignore[arg-type]  # what is no order is a report
 
-    def _worker_ended(self) -> None:
-        assert self._worker is not None
-        why, self._worker, self._ready = self._worker.describe(), None, False
-        self._lose_runs("worker_died", f"the process of its action died: {why}")
-        if self._owner is not None and not self._closing:
+    def _take_ready(self, child: Child, data: Mapping[str, Any]) -> None:
+        driver = child is self._owner
+        if driver and self._stage is Stage.DRIVER_STARTS:
+            self.streams = dict(data["streams"])
+            if self._emergency:
+                child.post([COMMAND, "", EMERGENCY_STOP])
+            if self._frozen_since is not None:
+                child.post([COMMAND, "", "hold"])
+        if driver and data["period"]:
+            if self._move(Happening.DRIVER_READY):
+                self._start_due()
+        elif self._move(Happening.READY):
+            self._worker, self.failed, self._died = child, "", ""
+            self._post_waiting(self._clock())
+
+    def _post_waiting(self, now: float) -> None:
+        if self._frozen_since is not None and self._worker is not None and self._worker is not self._owner:
+            self._worker.post(flat(Hold(True)))  # it was held while it was being started
+        for run in self._runs.values():
+            if run.posted is None:
+                self._post_begin(now, run)
+
+    def _ended(self, child: Child) -> None:
+        """A process has ended. That of a former one is no news."""
+        if child is self._owner:
+            self._all_ended(child)
+        elif child is self._worker:
+            if self._owner is None:
+                self._all_ended(child)
+            else:
+                self._actions_ended(child)
+        self._changed()
+
+    def _actions_ended(self, child: Child) -> None:
+        """The actions of a cyclic device: its driver is stopped, and what was lost is told when it stands."""
+        assert self._owner is not None
+        self._worker = None
+        self._died = f"the process of its actions died: {child.describe()}"
+        self._lose_runs(*_cause_of(child))
+        if self._move(Happening.ACTIONS_ENDED):
             self._halts += 1
             self._halt_due = self._clock() + STOP_LIMIT + MARGIN
             self._owner.post([COMMAND, f"{HALT}{self._halts}", HALT])
+            self._plan_restart(child)
         else:
             self._tell_lost("")
-        self._plan_restart()
 
-    def _owner_ended(self) -> None:
-        assert self._owner is not None
-        why = self._owner.describe()
-        alone = self._owner is self._worker or self._worker is None
-        self._owner, self._ready, self._cyclic, self.streams = None, False, False, {}
-        if alone:
-            self._worker = None
-            self._lose_runs("worker_died", f"the process of its action died: {why}")
-        elif self._worker is not None:
-            self._lose_runs("device_died", f"the process of its device's driver died: {why}")
-            self._worker.kill()
-        self._tell_lost("")
-        self._plan_restart()
+    def _all_ended(self, child: Child) -> None:
+        """The process with the driver, or the only one: nothing of this place runs any more."""
+        why, worker, was_ready = child.describe(), self._worker, self._stage is not Stage.DRIVER_STARTS
+        driver = child is self._owner and worker is not child and was_ready
+        self._owner = self._worker = None
+        self.streams = {}
+        self._died = f"the process of its {'driver' if driver else 'action'} died: {why}"
+        if driver:
+            self._lose_runs("device_died", DRIVER_DIED)
+            if worker is not None:
+                worker.kill()
+        else:
+            self._lose_runs(*_cause_of(child))
+        self._answer_commands()
+        self._tell_lost(f"driver: {why}" if driver else "")
+        if self._move(Happening.ALL_ENDED):
+            self._plan_restart(child)
 
-    def _plan_restart(self) -> None:
+    def _plan_restart(self, child: Child | None = None) -> None:
+        """Start again what has ended, or could not be started: the later, the more often that has happened of late."""
         now = self._clock()
-        self._deaths = 0 if now - self._started > STABLE else self._deaths + 1
-        if not self._closing:
-            self._restart_at = now + PAUSES[min(self._deaths, len(PAUSES)) - 1] if self._deaths else now
+        if child is not None and child is self._retiring:
+            self._retiring = None
+        elif child is None or child.code != LINK_LOST:  # one that has lost its driver dies of that one's death
+            self._deaths = 0 if now - self._started > STABLE else self._deaths + 1
+        pause = PAUSES[min(self._deaths, len(PAUSES)) - 1] if self._deaths else 0.0
+        if child is not None and child.code == LINK_LOST:
+            pause = max(pause, DRIVER_GONE)
+        self._restart_at = now + pause
         self._changed()
 
     # --- runs --------------------------------------------------------------------------------------------------------
+
+    def _take_end(self, end: Ended) -> None:
+        if self._runs.pop(end.id, None) is None:
+            return
+        self._deaths = 0  # the process has done what it is there for
+        self._reports.append(end)
+        alone = all(run.posted is None for run in self._runs.values())
+        if end.cause == OUT_OF_MEMORY and alone and self._worker is not None:
+            # What the run has kept would fail the next one, which may need little.
+            self._retiring = self._worker
+            self._worker.leave()
+        self._release_if_over()
+
+    def _end(self, id_: str, cause: str, text: str) -> None:
+        """A run that no process was told of ends."""
+        del self._runs[id_]
+        self._reports.append(Ended(id_, Status.ERROR, {}, cause, text, Executed.NO))
+        self._release_if_over()
 
     def _lose_runs(self, cause: str, text: str) -> None:
         """The process of the runs is gone: each that it had been told of ends, with what is known of it."""
@@ -217,10 +372,12 @@ class WorkerPlace:
             del self._runs[id_]
             took = self._clock() - run.posted
             if run.killed and run.stop is not None:
-                its_text = f"{run.stop.text}; it did not let go, its process was killed".lstrip("; ")
+                how = "it did not let go" if run.pong else "it blocked its process, which answered nothing"
+                its_text = f"{run.stop.text}; {how}; its process was killed".lstrip("; ")
                 self._lost.append(Ended(id_, Status.ERROR, {}, run.stop.cause, its_text, Executed.YES, took))
             else:
-                self._lost.append(Ended(id_, Status.ERROR, {}, cause, text, Executed.UNKNOWN, took))
+                executed = Executed.YES if cause == OUT_OF_MEMORY else Executed.UNKNOWN
+                self._lost.append(Ended(id_, Status.ERROR, {}, cause, text, executed, took))
 
     def _tell_lost(self, note: str) -> None:
         for end in self._lost:
@@ -235,7 +392,7 @@ class WorkerPlace:
         if isinstance(order, Begin):
             limit = math.inf if order.deadline is None else now + order.deadline
             self._runs[order.id] = run = _Watched(order, now, limit)
-            if self._ready:
+            if self.ready:
                 self._post_begin(now, run)
         elif isinstance(order, Stop):
             if order.id in self._runs:
@@ -252,8 +409,7 @@ class WorkerPlace:
         if run.stop is not None:
             return
         if run.posted is None or self._worker is None:
-            del self._runs[stop.id]
-            self._reports.append(Ended(stop.id, Status.ERROR, {}, stop.cause, stop.text, Executed.NO))
+            self._end(stop.id, stop.cause, stop.text)
             return
         run.stop, run.stopped_at = stop, now
         self._pings += 1
@@ -266,25 +422,36 @@ class WorkerPlace:
     def advance(self, now: float) -> None:
         """Start again what died; stop what is over its deadline; kill what hangs."""
         if self._restart_at is not None and now >= self._restart_at:
-            self.start()
+            self._start_due()
+        if self._stage in STARTING and now >= self._started + START_LIMIT:
+            self._give_start_up(now)
         if self._halt_due is not None and now >= self._halt_due:
             self._tell_lost("the device is not known to stand still")
         for id_, run in list(self._runs.items()):
-            if run.posted is None and now >= min(run.limit, run.taken + NOT_READY):
-                del self._runs[id_]
-                text = f"its process is not ready: {self.failed or 'it is being started'}"
-                self._reports.append(Ended(id_, Status.ERROR, {}, "not_ready", text, Executed.NO))
+            if run.posted is None and now >= self._wait_limit(run):
+                why = self.failed or self._died or "it is being started"
+                self._end(id_, "not_ready", f"its process is not ready: {why}")
             elif run.stop is None and now >= run.limit and self._frozen_since is None:
                 self._stop(now, run, Stop(id_, "deadline", f"not over after {run.begin.deadline:g} s"))
             elif run.stop is not None:
                 self._chase(now, run)
+
+    def _wait_limit(self, run: _Watched) -> float:
+        """Until when a run waits for its process."""
+        return min(run.limit, run.taken + (NOT_READY if self.failed else START_LIMIT))
+
+    def _give_start_up(self, now: float) -> None:
+        child = self._owner if self._stage is Stage.DRIVER_STARTS else self._worker
+        self._started = now  # once more, should even the kill come to nothing
+        if child is not None:
+            child.kill(f"it was not ready after {START_LIMIT:g} s, and was killed")
 
     def _chase(self, now: float, run: _Watched) -> None:
         """A stopped run that does not end: stop its device without it, then kill its process."""
         since = now - run.stopped_at
         if since >= SILENT and not run.pong and not run.halted:
             run.halted = True
-            if self._cyclic and self._owner is not None:
+            if self._owner is not None and self._owner is not self._worker:
                 self._owner.post([COMMAND, HALT, HALT])
         patience = GRACE + STOP_LIMIT + MARGIN if run.pong else GRACE
         if since >= patience and not run.killed and self._worker is not None:
@@ -293,10 +460,10 @@ class WorkerPlace:
 
     def due(self) -> float | None:
         """When `advance` has something to do at the latest (s)."""
-        times = [self._restart_at, self._halt_due]
+        times = [self._restart_at, self._halt_due, self._started + START_LIMIT if self._stage in STARTING else None]
         for run in self._runs.values():
             if run.posted is None:
-                times.append(min(run.limit, run.taken + NOT_READY))
+                times.append(self._wait_limit(run))
             elif run.stop is None:
                 times.append(run.limit if run.limit < math.inf and self._frozen_since is None else None)
             elif not run.killed:
@@ -310,20 +477,40 @@ class WorkerPlace:
         """Carry out an operator's command in the process that has the driver."""
         if verb in (EMERGENCY_STOP, CLEAR_EMERGENCY):
             self._emergency = verb == EMERGENCY_STOP
-        target = self._owner if self._cyclic else self._worker
-        if target is None or not (self._ready or self._cyclic):
-            data = {"text": self.failed, "runs": list(self._runs), "pids": self.pids()}
-            self._reports.append(Told(id, "not ready", data))
-            return
-        target.post([COMMAND, id, verb])  # first: the device waits for nobody
+        target = self._commanded()
+        if target is None:
+            self._refuse(id, verb)
+        else:
+            self._commands[id] = verb
+            target.post([COMMAND, id, verb])  # first: the device waits for nobody
         if verb in ("stop", EMERGENCY_STOP):
             cause = "stopped" if verb == "stop" else EMERGENCY_STOP
             for run_id, run in list(self._runs.items()):
                 self._stop(now, run, Stop(run_id, cause, "by command"))
-        elif verb == "hold":
-            self._holds.add(id)
         elif verb == "release":
             self._freeze(False)
+        elif verb == "hold" and target is None and not self._setup.device:
+            self._freeze(True)  # it holds as soon as it is ready, before its runs begin
+
+    def _commanded(self) -> Child | None:
+        """The process that carries out commands: the ready driver's, else the worker's."""
+        if self._stage in (Stage.DOWN, Stage.DRIVER_STARTS, Stage.CLOSED):
+            return None
+        found = self._owner or (self._worker if self._stage is Stage.READY else None)
+        return found if found is not None and not found.closed else None
+
+    def _refuse(self, id_: str, verb: str) -> None:
+        """No process can answer a command."""
+        word, why = self.condition
+        done = "not ready" if self._setup.device else DONE.get(verb, "stopped")
+        answer = word if verb == "status" else done
+        self._reports.append(Told(id_, answer, {"text": why, "runs": list(self._runs), "pids": self.pids()}))
+
+    def _answer_commands(self) -> None:
+        """The process that was to answer them has ended."""
+        commands, self._commands = self._commands, {}
+        for id_, verb in commands.items():
+            self._refuse(id_, verb)
 
     def _freeze(self, frozen: bool) -> None:
         """Hold the runs, or let them go on with their deadlines moved by the pause."""
@@ -334,7 +521,7 @@ class WorkerPlace:
             for run in self._runs.values():
                 run.limit += now - self._frozen_since
             self._frozen_since = None
-        if self._cyclic and self._worker is not None:
+        if self._worker is not None and self._worker is not self._owner and self._owner is not None:
             self._worker.post(flat(Hold(frozen)))
 
     def _release_if_over(self) -> None:
@@ -342,20 +529,23 @@ class WorkerPlace:
         if self._runs or self._frozen_since is None:
             return
         self._freeze(False)
-        if self._cyclic and self._owner is not None:
+        if self._owner is not None and self._owner is not self._worker:
             self._owner.post([COMMAND, "", "release"])
 
     def _told(self, told: Told) -> None:
         if told.id.startswith(HALT):
-            note = "" if told.answer == "stopped" else "the device is not known to stand still"
-            self._tell_lost(note)
+            if self._halt_due is not None and told.id == f"{HALT}{self._halts}":  # not that of an earlier order
+                self._tell_lost("" if told.answer == "stopped" else "the device is not known to stand still")
             return
-        if told.id in self._holds:
-            self._holds.discard(told.id)
-            if told.answer != "cannot hold":
-                self._freeze(True)
-        data = {**told.data, "runs": list(self._runs), "pids": self.pids()}
-        self._reports.append(Told(told.id, told.answer, data))
+        verb = self._commands.pop(told.id, "")
+        if verb == "hold" and told.answer != "cannot hold":
+            self._freeze(True)
+        data, answer = {**told.data, "runs": list(self._runs), "pids": self.pids()}, told.answer
+        if verb == "status":
+            answer, data["text"] = self.condition
+            if answer == "up" and told.data.get("fenced"):
+                answer, data["text"] = "fenced", "the device is not known to stand still after an earlier run"
+        self._reports.append(Told(told.id, answer, data))
 
     def stream_at(self, stream: str, host: str, port: int, ticket: str) -> None:
         """Tell the actions where a stream is received."""
@@ -369,7 +559,8 @@ class WorkerPlace:
 
     def close(self, now: float) -> None:
         """Let the processes end in good order."""
-        self._closing, self._restart_at = True, None
+        self._move(Happening.CLOSE)
+        self._restart_at = None
         for child in self.children():
             child.leave()
 
@@ -377,3 +568,12 @@ class WorkerPlace:
         """Its processes."""
         found = [self._owner, self._worker if self._worker is not self._owner else None]
         return [child for child in found if child is not None]
+
+
+def _cause_of(child: Child) -> tuple[str, str]:
+    """Cause and text of the runs of a process that has ended by itself."""
+    if child.code == LINK_LOST:
+        return "device_died", DRIVER_DIED
+    if child.code == NO_MEMORY:
+        return OUT_OF_MEMORY, "the memory of its process was used up; see worker_memory_mb in services.toml"
+    return "worker_died", f"the process of its action died: {child.describe()}"

@@ -6,12 +6,15 @@ import asyncio
 import contextlib
 import json
 import os
+import signal
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from coordinator.campaign.plan import CampaignError, Plan
+from coordinator.supervisor import LAST_WORDS, output_pipe
+from services.comm.parentage import until_ended
 
 RETIRES_AFTER = 200
 """Blocks after which a worker is replaced, so that what a user's action or a native library may leak does not add up."""
@@ -29,39 +32,55 @@ class WorkerLost(Exception):  # noqa: N818 - what happened
 class _Worker:
     """One process and the way to it."""
 
-    def __init__(self, process: asyncio.subprocess.Process) -> None:
+    def __init__(
+        self, process: asyncio.subprocess.Process, said: asyncio.StreamReader, closing: contextlib.AsyncExitStack
+    ) -> None:
         self.process = process
         self.done = 0
+        self._said = said
+        self._closing = closing
 
     @classmethod
     async def start(cls, plan: str, log: Path) -> _Worker:
         """Launch a process and tell it the plan; what it says beside its answers goes to `log`."""
-        pipe = asyncio.subprocess.PIPE
         command = (sys.executable, "-m", "coordinator.campaign.worker", str(os.getpid()))
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p), **ONE_THREAD}
-        with log.open("ab") as said:
-            process = await asyncio.create_subprocess_exec(
-                *command,
-                stdin=pipe,
-                stdout=pipe,
-                stderr=said,
-                env=environment,
-                limit=LONGEST_LINE,
-                start_new_session=True,
-            )
-        worker = cls(process)
+        async with contextlib.AsyncExitStack() as closing:
+            end, said = await closing.enter_async_context(output_pipe(LONGEST_LINE))
+            with log.open("ab") as words:
+                process = await asyncio.create_subprocess_exec(
+                    *command,
+                    stdin=asyncio.subprocess.PIPE,
+                    stdout=end,
+                    stderr=words,
+                    env=environment,
+                    start_new_session=True,
+                )
+            end.close()
+            worker = cls(process, said, closing.pop_all())
         await worker._tell(plan)
         return worker
 
     async def ask(self, order: str) -> dict[str, Any]:
         """Hand over a block and wait for its result. Raises WorkerLost."""
-        assert self.process.stdout is not None
         await self._tell(order)
-        line = await self.process.stdout.readline()
+        line = await self._line()
         if not line.endswith(b"\n"):
             raise WorkerLost(f"worker {self.process.pid} ended")
         self.done += 1
         return json.loads(line)  # type: ignore[no-any-return]
+
+    async def _line(self) -> bytes:
+        """What it says next; what there is of it when the process ends. What it has left running may hold the pipe open."""
+        reading = asyncio.create_task(self._said.readline())
+        ended = asyncio.create_task(until_ended(self.process.pid))
+        try:
+            await asyncio.wait({reading, ended}, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait({reading}, timeout=LAST_WORDS)
+            return reading.result() if reading.done() else b""
+        finally:
+            reading.cancel()
+            ended.cancel()
 
     async def _tell(self, line: str) -> None:
         assert self.process.stdin is not None
@@ -72,10 +91,13 @@ class _Worker:
             raise WorkerLost(f"worker {self.process.pid} ended") from fault
 
     async def end(self) -> None:
-        """Kill the process if it is still there."""
+        """Kill the process if it is still there, and what its actions have left in its session."""
         with contextlib.suppress(ProcessLookupError):
-            self.process.kill()
+            os.killpg(self.process.pid, signal.SIGKILL)
+        assert self.process.stdin is not None
+        self.process.stdin.close()  # `wait` waits for that, too
         await self.process.wait()
+        await self._closing.aclose()
 
 
 class LocalPool:

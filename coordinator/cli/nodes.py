@@ -28,18 +28,33 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Ask; 0 when all are up, 3 otherwise."""
+    """Ask; 0 when all are up, that is take calls, 3 otherwise."""
     from coordinator.mission.asking import ask_all
 
     directory = load_directory(options.services)
     answers = asyncio.run(ask_all(directory, options.timeout))
     for node, devices in _stopped(directory, answers).items():
         answers[node]["stopped"] = devices
+    for answer in answers.values():
+        if answer["up"] and (troubles := _troubles(answer["status"])):
+            answer |= {"up": False, "not_ready": troubles}
     if options.json:
         write_json(options.json, answers)
     if options.json != "-":
         _print(answers)
     return 0 if all(answer["up"] for answer in answers.values()) else 3
+
+
+def _troubles(status: Mapping[str, Any]) -> dict[str, str]:
+    """What of a node that answers would not take a call now, and why: devices, and `actions` for those without a device."""
+    said = {name: (word, status["devices"].get(name, {})) for name, word in status["answers"].items()}
+    if "general" in status:
+        said["actions"] = (status["general"]["answer"], status["general"])
+    return {
+        name: f"{word}: {data['text']}" if data.get("text") else word
+        for name, (word, data) in said.items()
+        if word != "up"
+    }
 
 
 def _stopped(directory: Directory, answers: Mapping[str, Any]) -> dict[str, list[str]]:
@@ -65,21 +80,27 @@ def _print(answers: dict[str, Any]) -> None:
     for column in ("node", "address", "", *(["certificate ends"] if certified else []), "offers", "devices"):
         table.add_column(column)
     for node, answer in answers.items():
-        state = "[green]up[/]" if answer["up"] else "[red]away[/]"
-        devices = answer.get("status", {}).get("devices", {})
-        shown = _devices(devices, answer.get("stopped", []))
+        troubles = answer.get("not_ready", {})
+        state = "[green]up[/]" if answer["up"] else "[yellow]not ready[/]" if troubles else "[red]away[/]"
+        devices = [*answer.get("status", {}).get("devices", {}), *troubles]
+        shown = _devices(devices, answer.get("stopped", []), troubles)
         ends = [_ends(answer.get("certificate_ends", ""))] if certified else []
         offers = ", ".join(answer.get("offers", [answer.get("why", "")]))
         table.add_row(node, answer["address"], state, *ends, offers, shown)
     Console().print(table)
 
 
-def _devices(devices: Iterable[str], stopped: Sequence[str]) -> str:
-    """Names of devices, each that an emergency stop holds with what to do about it."""
-    return ", ".join(
-        f"{device} [red]stopped (petrobot estop --clear)[/]" if device in stopped else device
-        for device in dict.fromkeys((*devices, *stopped))
-    )
+def _devices(devices: Iterable[str], stopped: Sequence[str], troubles: Mapping[str, str]) -> str:
+    """Names of devices; with each that takes no call what it does instead, or what to do about it."""
+
+    from rich.markup import escape
+
+    def shown(device: str) -> str:
+        if device in stopped:
+            return f"{device} [red]stopped (petrobot estop --clear)[/]"
+        return f"{device} [yellow]{escape(troubles[device])}[/]" if device in troubles else device
+
+    return ", ".join(shown(device) for device in dict.fromkeys((*devices, *stopped)))
 
 
 def _ends(ends: str) -> str:

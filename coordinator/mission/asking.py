@@ -71,7 +71,6 @@ def _status(status: dict[str, Any], node: str, directory: Directory) -> dict[str
     """A node's status with devices alone under `devices`: it tells of its actions without one under its own name."""
     answers, devices = dict(status.get("answers", {})), dict(status.get("devices", {}))
     general = {}
-    if node not in directory.devices and node in devices:
-        answers.pop(node, None)
-        general = {"general": devices.pop(node)}
+    if node not in directory.devices and node in answers:
+        general = {"general": {"answer": answers.pop(node), **devices.pop(node, {})}}
     return {**status, "answers": answers, "devices": devices, **general}

@@ -89,6 +89,9 @@ SHAPES: Mapping[str, Mapping[str, Key]] = {
         "worker_memory_mb": Key(
             "a whole number of MiB above 0", lambda v: isinstance(v, int) and not isinstance(v, bool) and v > 0
         ),
+        "workers": Key(
+            "a whole number of processes above 0", lambda v: isinstance(v, int) and not isinstance(v, bool) and v > 0
+        ),
     },
     "devices": {"node": _name_key("a node", required=True), "driver": _path_key("Class")},
     "actions": {

@@ -13,12 +13,16 @@ import ctypes
 import os
 import signal
 import sys
+from pathlib import Path
 
-PR_SET_PDEATHSIG, PR_GET_PDEATHSIG = 1, 2
+PR_SET_PDEATHSIG, PR_GET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 2, 36
 STOP_ROUTINE = signal.SIGQUIT
 """Its number is how many seconds a process with a device may go on without its node: the stop limit of 2 s, and a margin."""
 GOOD_ORDER = signal.SIGUSR1
 """Its number is how many seconds a node may take to end in good order once its launcher is gone."""
+
+LOOK_AGAIN = 0.02
+"""Seconds between looks at a process, where the kernel does not tell of its end."""
 
 _LIBC = ctypes.CDLL(None, use_errno=True)
 
@@ -37,6 +41,51 @@ def outlive(parent: int, by: signal.Signals) -> None:
     _LIBC.signal(by, ctypes.cast(_LIBC.alarm, ctypes.c_void_p))
     _ask(by)
     _still_there(parent)
+
+
+def notify_of_end(parent: int, by: signal.Signals) -> None:
+    """Have the kernel send this signal when the parent ends."""
+    _ask(by)
+    _still_there(parent)
+
+
+def adopt_orphans() -> None:
+    """Become the parent of every descendant whose own parent ends (PR_SET_CHILD_SUBREAPER)."""
+    if _LIBC.prctl(PR_SET_CHILD_SUBREAPER, 1) != 0:
+        raise OSError(ctypes.get_errno(), "prctl(PR_SET_CHILD_SUBREAPER)")
+
+
+async def until_ended(process: int) -> None:
+    """Wait until a child of this process has ended. It need not have been waited for (it is left for that).
+
+    The end of a pipe to a process is no sign of its end: a process that it has left running may hold the other end.
+    """
+    import asyncio  # here, not above: a worker's keeper needs nothing of it, and there is one beside each worker
+
+    loop = asyncio.get_running_loop()
+    try:
+        number = os.pidfd_open(process)
+    except ProcessLookupError:
+        return
+    except (AttributeError, OSError):  # a kernel before 5.3, or a sandbox that does not permit it
+        while _runs(process):
+            await asyncio.sleep(LOOK_AGAIN)
+        return
+    ended = asyncio.Event()
+    loop.add_reader(number, ended.set)
+    try:
+        await ended.wait()
+    finally:
+        loop.remove_reader(number)
+        os.close(number)
+
+
+def _runs(process: int) -> bool:
+    """Whether a process exists and is not a zombie."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
 
 
 def wanted_with_parent() -> bool:

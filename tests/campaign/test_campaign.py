@@ -422,3 +422,22 @@ def test_a_cost_that_no_result_has_is_said(conduct: Conduct, tmp_path: Path) -> 
     assert result["judged"]["grip"]["uncosted"] == ["grip_soft"]
     result["chosen"]["grip"]["grip_hard"] = 1  # primitive tasks without a choice are not printed
     assert "grip_soft: no run reported value:forse" in text_of(result)
+
+
+@pytest.mark.processes
+async def test_what_a_dead_worker_has_left_running_does_not_hide_its_death(
+    tmp_path: Path, toy_plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its child holds its output and its input open; it ends with it."""
+    mark, program = tmp_path / "left", tmp_path / "worker"
+    program.write_text(f"#!/bin/sh\nread plan\nsleep 3600 &\necho $! > {mark}\nread order\nkill -9 $$\n")
+    program.chmod(0o755)
+    monkeypatch.setattr("sys.executable", str(program))
+    order = {"block": toy_plan.blocks[0].to_plain(), "weights": []}
+    async with asyncio.timeout(60.0), LocalPool(toy_plan, 1, tmp_path / "log") as pool:
+        with pytest.raises(CampaignError, match="ended 3 workers"):
+            await pool.run(order)
+        assert pool.lost == 3
+        left = int(mark.read_text())
+        while Path(f"/proc/{left}").exists() and " Z " not in Path(f"/proc/{left}/stat").read_text():
+            await beat(0.01)

@@ -94,3 +94,21 @@ async def test_one_that_does_not_end_when_asked_is_killed(tmp_path: Path) -> Non
     async with Supervisor([program("a", STUBBORN)], tmp_path) as keeper:
         process = keeper.process_ids()["a"]
     assert gone(process)
+
+
+async def test_what_a_dead_program_has_left_running_does_not_hide_its_death(tmp_path: Path) -> None:
+    """Its child holds its output open, and goes on talking."""
+    talker = "while echo alive; do sleep 0.05; done"
+    leaver = f"import subprocess; print(subprocess.Popen(['sh', '-c', {talker!r}]).pid, flush=True); {STEADY}"
+    said: list[str] = []
+    try:
+        async with Supervisor([program("a", leaver)], tmp_path, notice=said.append) as keeper:
+            os.kill(keeper.process_ids()["a"], signal.SIGKILL)
+            await until_said(said, 1)
+            async with asyncio.timeout(60.0):
+                while keeper.starts("a") < 2 or not keeper.process_ids():
+                    await beat(0.01)
+    finally:
+        for line in (tmp_path / "a.log").read_text().splitlines():
+            if line.isdigit():
+                os.kill(int(line), signal.SIGKILL)

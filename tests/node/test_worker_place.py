@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Callable
-from itertools import pairwise
+from functools import partial
+from itertools import pairwise, product
 from typing import Any
 
 import pytest
@@ -12,10 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from services.pipe import NewestLink
+from services.remote import EMERGENCY_STOP
 from services.runner import GRACE, STOP_LIMIT
 from services.runs import Answered, Begin, Ended, Hold, Order, Raised, Stop, Told, flat, record
-from services.worker import COMMAND, FAILED, PING, PONG, READY, STREAM_AT, WANTED, Setup
-from services.worker_place import MARGIN, NOT_READY, SILENT, WorkerPlace
+from services.worker import COMMAND, FAILED, LINK_LOST, PING, PONG, READY, STREAM_AT, WANTED, Setup
+from services.worker_place import MARGIN, NEXT, NOT_READY, PAUSES, SILENT, START_LIMIT, Happening, Stage, WorkerPlace
 from tests.node.conftest import Clock
 from tests.waiting import Limit
 
@@ -23,10 +25,14 @@ from tests.waiting import Limit
 class FakeChild:
     """A child process that does what the test says."""
 
-    def __init__(self, setup: Setup, heard: Callable[[list[Any]], None], ended: Callable[[], None], link: Any) -> None:
+    def __init__(
+        self, setup: Setup, heard: Callable[[Any, list[Any]], None], ended: Callable[[Any], None], link: Any
+    ) -> None:
         self.setup = setup
-        self.say = heard
+        self.say = partial(heard, self)
         self._ended = ended
+        self.code: int | None = None
+        self.closed = self.dead = False
         self.link = link
         self.linked = link is not None
         self._drop(link)
@@ -47,17 +53,18 @@ class FakeChild:
         self._drop(end)
         self.post([word])
 
-    def kill(self) -> None:
+    def kill(self, why: str = "") -> None:
         self.killed = True
 
     def leave(self) -> None:
-        self.left = True
+        self.left = self.closed = True
 
     def describe(self) -> str:
         return "it was ended by SIGTEST"
 
-    def die(self) -> None:
-        self._ended()
+    def die(self, code: int = -9) -> None:
+        self.code, self.closed, self.dead = code, True, True
+        self._ended(self)
 
     def ready(self, period: float | None = None, **streams: int) -> None:
         self.say([READY, {"period": period, "streams": streams, "fifo": False}])
@@ -286,62 +293,190 @@ def test_closing_lets_all_children_go() -> None:
     assert len(bench.children) == 2
 
 
-@settings(max_examples=80, deadline=None)
-@given(
-    acts=st.lists(
-        st.tuples(
-            st.sampled_from(
-                ["begin", "stop", "end", "pong", "die", "driver dies", "ready", "halted", "hold", "release"]
-            ),
-            st.integers(0, 3),
-            st.floats(0.0, 1.0),
-        ),
-        max_size=30,
-    )
+class Storm:
+    """A place under any order of what may happen to it, with the books of its runs and of its processes."""
+
+    def __init__(self, kind: str) -> None:
+        self.bench = Bench("" if kind == "none" else "arm")
+        self.kind = kind
+        self.begun: list[str] = []
+        self.ready_children: set[int] = set()
+
+    def living(self) -> list[FakeChild]:
+        return [child for child in self.bench.children if not child.dead]
+
+    def make_ready(self, child: FakeChild) -> None:
+        """As a real one: once, while it lives and its pipe is open."""
+        if not child.dead and not child.closed and id(child) not in self.ready_children:
+            self.ready_children.add(id(child))
+            child.ready(0.004 if self.kind == "cyclic" and not child.linked else None)
+
+    def happen(self, act: str) -> None:
+        bench, now = self.bench, self.bench.clock.now
+        living, dead = self.living(), [child for child in self.bench.children if child.dead]
+        drivers = [child for child in living if not child.linked]
+        workers = [child for child in living if child.linked or self.kind != "cyclic"]
+        newest = f"r{len(self.begun) - 1}"
+        if act == "begin":
+            self.begun.append(f"r{len(self.begun)}")
+            bench.begin(self.begun[-1], 1.0)
+        elif act == "ready" and living:
+            self.make_ready(living[-1])
+        elif act == "driver dies" and drivers:
+            drivers[-1].die()
+        elif act == "actions die" and workers:
+            workers[-1].die()
+        elif act == "link lost" and workers:
+            workers[-1].die(LINK_LOST)
+        elif act == "end" and workers:
+            had = [o.id for o in workers[-1].orders() if isinstance(o, Begin)]
+            if newest in had:
+                workers[-1].say(flat(Ended(newest, "success")))
+        elif act == "no memory" and workers:
+            workers[-1].say(flat(Ended(newest, "error", {}, "out_of_memory")))
+        elif act == "late words":
+            for child in dead:
+                child.ready(0.004)
+                child.ready()
+                child.say(flat(Ended(newest, "success")))
+                child.say([FAILED, "long ago"])
+        elif act == "garbage" and living:
+            living[-1].say(["nothing", 1])
+            living[-1].say([])
+        elif act == "failed" and living:
+            living[-1].say([FAILED, "no bus"])
+            living[-1].die(0)
+        elif act == "stop":
+            bench.place.take(now, Stop(newest))
+        elif act in ("hold", "release", "status", EMERGENCY_STOP):
+            bench.place.command(now, act, act)
+            for child in living:
+                if [COMMAND, act, act] in child.got:
+                    child.say(flat(Told(act, "held" if act == "hold" else "done")))
+        elif act == "halted" and drivers:
+            drivers[-1].say(flat(Told("halt1", "stopped")))
+        elif act == "wait":
+            bench.run(1.5)
+        bench.run(0.0)
+
+    def kill_the_killed(self) -> None:
+        for child in self.living():
+            if child.killed or child.left:
+                child.die()
+
+    def settle(self) -> None:
+        """Time passes: what was killed dies, what was started becomes ready, and devices answer."""
+        self.bench.place.command(self.bench.clock.now, "end of hold", "release")
+        for _ in range(20):
+            self.kill_the_killed()
+            for child in self.living():
+                self.make_ready(child)
+            self.bench.run(2.0)
+
+    def ends_well(self) -> None:
+        """It is ready, takes a run, and every run that it has taken has ended once."""
+        self.settle()
+        place = self.bench.place
+        assert place.ready and place.condition == ("up", ""), (place.stage, place.condition)
+        wanted = {"actions", "driver"} if self.kind == "cyclic" else {"actions"}
+        assert set(place.pids()) == wanted and len(self.living()) == len(wanted)
+        self.bench.begin("last", 1.0)
+        worker = self.living()[-1]
+        assert Begin("last", "act", {}, 1.0) in worker.orders()
+        worker.say(flat(Ended("last", "success")))
+        self.bench.run(30.0)
+        ends = [report.id for report in self.bench.reports if isinstance(report, Ended)]
+        assert sorted(ends) == sorted([*self.begun, "last"])
+
+
+ACTS = (
+    *("begin", "ready", "driver dies", "actions die", "late words", "end", "stop", "wait", "link lost"),
+    *("no memory", "garbage", "failed", "hold", "release", "status", EMERGENCY_STOP, "halted"),
 )
-def test_every_run_ends_exactly_once(acts: list[tuple[str, int, float]]) -> None:
+
+
+@settings(max_examples=300, deadline=None)
+@given(kind=st.sampled_from(["cyclic", "device", "none"]), acts=st.lists(st.sampled_from(ACTS), max_size=30))
+def test_whatever_happens_it_is_ready_again_and_every_run_ends_once(kind: str, acts: list[str]) -> None:
+    storm = Storm(kind)
+    for act in acts:
+        storm.happen(act)
+    storm.ends_well()
+
+
+@pytest.mark.parametrize("kind", ["cyclic", "device", "none"])
+def test_every_order_of_deaths_and_starts_ends_well(kind: str) -> None:
+    """All sequences of five of the acts that move the place from one stage to another."""
+    for acts in product(("begin", "ready", "driver dies", "actions die", "late words", "wait"), repeat=5):
+        storm = Storm(kind)
+        for act in acts:
+            storm.happen(act)
+        storm.ends_well()
+
+
+def test_every_stage_can_be_reached_and_left_by_the_table() -> None:
+    reached = {Stage.DOWN, *NEXT.values()}
+    assert reached == set(Stage)
+    for stage in set(Stage) - {Stage.CLOSED}:
+        assert {happening for at, happening in NEXT if at is stage} > {Happening.CLOSE}, stage
+    waiting = {Stage.DRIVER_STARTS, Stage.ACTIONS_START, Stage.ACTIONS_DOWN, Stage.READY}
+    assert all(NEXT[stage, Happening.ALL_ENDED] is Stage.DOWN for stage in waiting)
+
+
+def test_the_end_of_a_former_process_does_not_touch_the_present_one() -> None:
+    bench = Bench()
+    driver, actions = bench.cyclic()
+    driver.die()
+    bench.run(0.0)
+    new_driver, new_actions = bench.cyclic()
+    assert {driver, actions}.isdisjoint({new_driver, new_actions})
+    actions.die()
+    actions.ready()
+    bench.run(0.0)
+    assert bench.place.ready and set(bench.place.pids()) == {"actions", "driver"}
+    assert len(bench.children) == 4
+
+
+def test_status_says_what_the_place_is_doing() -> None:
+    def status() -> Told:
+        bench.place.command(bench.clock.now, "s", "status")
+        for child in bench.children:
+            if not child.dead and [COMMAND, "s", "status"] in child.got:
+                child.got.clear()
+                child.say(flat(Told("s", "up")))
+        (told,) = [r for r in bench.run(0.0) if isinstance(r, Told)]
+        return told
+
+    bench = Bench()
+    assert status().answer == "starting"
+    driver, actions = bench.cyclic()
+    assert status().answer == "up"
+    actions.die()
+    assert (status().answer, "SIGTEST" in status().data["text"]) == ("restarting", True)
+    bench.children[-1].ready()
+    assert status().answer == "up"
+    driver.die()
+    assert (status().answer, "driver" in status().data["text"]) == ("restarting", True)
+    bench.run(PAUSES[1])
+    bench.children[-1].say([FAILED, "no bus"])
+    bench.children[-1].die(0)
+    assert (status().answer, status().data["text"]) == ("failed", "no bus")
+
+
+def test_a_process_that_never_becomes_ready_is_killed_and_started_again() -> None:
+    bench = Bench()
+    bench.run(START_LIMIT - 0.1)
+    assert [child.killed for child in bench.children] == [False]
+    bench.run(0.2)
+    assert [child.killed for child in bench.children] == [True]
+    bench.children[0].die()
+    bench.run(1.0)
+    assert len(bench.children) == 2
+
+
+def test_a_command_is_answered_although_its_process_dies() -> None:
     bench = Bench()
     bench.cyclic()
-    dead: set[int] = set()
-    begun: set[str] = set()
-    for act, number, pause in acts:
-        living = [c for c in bench.children if id(c) not in dead]
-        driver = next((c for c in living if not c.linked), None)
-        worker = next((c for c in living if c.linked), None)
-        identity = f"r{number}"
-        if act == "begin" and identity not in begun:
-            begun.add(identity)
-            bench.begin(identity, 1.0)
-        elif act == "stop":
-            bench.place.take(bench.clock.now, Stop(identity))
-        elif act == "end" and worker and identity in {o.id for o in worker.orders() if isinstance(o, Begin)}:
-            worker.say(flat(Ended(identity, "success")))
-        elif act == "pong" and worker:
-            worker.say([PONG, 1])
-        elif act == "die" and worker:
-            dead.add(id(worker))
-            worker.die()
-        elif act == "driver dies" and driver:
-            dead.add(id(driver))
-            driver.die()
-        elif act == "ready" and living:
-            living[-1].ready(0.004 if not living[-1].linked else None)
-        elif act == "halted" and driver:
-            driver.say(flat(Told("halt1", "stopped")))
-        elif act == "hold" and driver:
-            driver.say(flat(Told("nobody asked", "held")))
-        elif act == "release":
-            bench.place.command(bench.clock.now, "x", "release")
-        bench.run(pause)
-        for child in bench.children:
-            if child.killed and id(child) not in dead:
-                dead.add(id(child))
-                child.die()
-    for _ in range(40):
-        bench.run(1.0)
-        for child in bench.children:
-            if child.killed and id(child) not in dead:
-                dead.add(id(child))
-                child.die()
-    ends = [r.id for r in bench.reports if isinstance(r, Ended)]
-    assert len(ends) == len(set(ends)) and set(ends) == begun
+    bench.place.command(bench.clock.now, "p", "picture")
+    bench.children[0].die()
+    assert [(r.id, r.answer) for r in bench.run(0.0) if isinstance(r, Told)] == [("p", "not ready")]

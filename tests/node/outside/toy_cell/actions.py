@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import ctypes
+import multiprocessing
 import os
+import subprocess
+import time
+from pathlib import Path
 
 from services.action import Cancelled, Context, Result, Status, error, failure, success
 
@@ -138,6 +142,15 @@ def eat(ctx: Context, *, megabytes: int) -> Result:
     return success(bytes=len(block))
 
 
+def keep_memory(ctx: Context) -> Result:
+    """Take all memory there is, bit by bit, and keep it."""
+    while True:
+        kept.append(bytearray(1 << 16))
+
+
+kept: list[bytearray] = []
+
+
 def pid(ctx: Context) -> Result:
     """Which process runs this."""
     return success(pid=os.getpid())
@@ -171,3 +184,78 @@ def judge(ctx: Context, *, run: str) -> Result:
     """Say what an earlier run really came to."""
     ctx.verdict(run, Status.FAILURE, "crooked")
     return success()
+
+
+def block(ctx: Context, *, seconds: float) -> Result:
+    """Hold the interpreter's only thread, as a driver's library may."""
+    time.sleep(seconds)
+    return success(slept=seconds)
+
+
+def leave_behind(ctx: Context, *, how: str, mark: str, then: str = "return") -> Result:
+    """Start something that lives on, in one of many ways; `mark` gets its process id. Then return, block, crash or leave."""
+    LEAVERS[how](mark)
+    while not (Path(mark).exists() and Path(mark).read_text()):
+        time.sleep(0.005)
+    if then == "block":
+        time.sleep(3600.0)
+    elif then == "crash":
+        ctypes.string_at(8)
+    return success(pid=os.getpid())
+
+
+def _live_on(mark: str) -> None:
+    Path(mark).write_text(str(os.getpid()))
+    time.sleep(3600.0)
+
+
+def _fork(mark: str) -> None:
+    multiprocessing.get_context("fork").Process(target=_live_on, args=(mark,), daemon=True).start()
+
+
+def _daemon(mark: str) -> None:
+    """Fork twice into a session of its own: its parent is gone, and so is all that tells where it comes from."""
+    if os.fork() == 0:
+        os.setsid()
+        os.environ.clear()
+        if os.fork() == 0:
+            _live_on(mark)
+        os._exit(0)
+    os.wait()
+
+
+def _program(mark: str) -> None:
+    left.append(subprocess.Popen(["sleep", "3600"]))
+    Path(mark).write_text(str(left[-1].pid))
+
+
+def _program_with_sockets(mark: str) -> None:
+    """A program that is given every descriptor of this process that it can have."""
+    open_ones = [int(one.name) for one in Path("/proc/self/fd").iterdir() if int(one.name) > 2]
+    passed = [one for one in open_ones if Path(f"/proc/self/fd/{one}").exists()]
+    left.append(subprocess.Popen(["sleep", "3600"], pass_fds=passed, start_new_session=True))
+    Path(mark).write_text(str(left[-1].pid))
+
+
+def _no_pipe(mark: str) -> None:
+    """Close every descriptor, the pipe to the node among them."""
+    os.closerange(3, 1000)
+    Path(mark).write_text(str(os.getpid()))
+
+
+def _fork_that_returns(mark: str) -> None:
+    """A copy of the worker that comes back from the action as if it were the worker."""
+    if os.fork() == 0:
+        return
+    Path(mark).write_text(str(os.getpid()))
+
+
+LEAVERS = {
+    "fork": _fork,
+    "daemon": _daemon,
+    "program": _program,
+    "program with sockets": _program_with_sockets,
+    "no pipe": _no_pipe,
+    "fork that returns": _fork_that_returns,
+}
+left: list[subprocess.Popen[bytes]] = []

@@ -1,0 +1,201 @@
+"""What user code does wrong ends its own run alone: what it leaves behind, how it blocks, what it takes, and who is spared."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import time
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+
+from tests.node.test_kills import passing
+from tests.node.test_processes import CELL, PATIENCE, Nodes, Operator, alive, operator_of, pids
+
+pytestmark = pytest.mark.processes
+DEADLINE = 1.0
+LATE = 5.0
+"""Seconds after its deadline in which a run must have ended, on a host as busy as this: grace, kill, and a margin."""
+TEXT = (
+    CELL.replace("worker_memory_mb = 900\n", "worker_memory_mb = 900\nworkers = 6\n")
+    + """\
+leave_behind = {{ run = "toy_cell.actions:leave_behind", task = "sum", node = "left" }}
+leave_behind_eye = {{ run = "toy_cell.actions:leave_behind", task = "see", device = "eye" }}
+leave_behind_slide = {{ run = "toy_cell.actions:leave_behind", task = "move", device = "slide" }}
+keep_memory = {{ run = "toy_cell.actions:keep_memory", task = "sum", node = "left" }}
+block = {{ run = "toy_cell.actions:block", task = "sum", node = "left" }}
+"""
+)
+WAYS = ("fork", "daemon", "program", "program with sockets")
+PLACES = ("leave_behind", "leave_behind_eye", "leave_behind_slide")
+
+
+@pytest.fixture
+async def nodes(tmp_path: Path) -> AsyncIterator[Nodes]:
+    """Both nodes, for this test alone."""
+    running = Nodes(tmp_path, "left", "right", text=TEXT)
+    try:
+        yield running
+    finally:
+        running.stop()
+
+
+@pytest.fixture
+async def operator(nodes: Nodes) -> AsyncIterator[Operator]:
+    """Connected to both."""
+    async with operator_of(nodes.directory, "left", "right") as one:
+        yield one
+
+
+async def gone(operator: Operator, process: int) -> None:
+    """Wait until a process has ended."""
+
+    async def ended() -> bool:
+        return not alive(process)
+
+    await operator.until(ended)
+
+
+@pytest.mark.parametrize("how", WAYS)
+async def test_a_deadline_holds_whatever_was_left_behind(operator: Operator, tmp_path: Path, how: str) -> None:
+    for service in PLACES:
+        mark = tmp_path / f"{service} {how}"
+        began = time.monotonic()
+        end = await operator.call(service, DEADLINE, how=how, mark=str(mark), then="block")
+        took = time.monotonic() - began
+        assert (end.status, end.cause, end.executed) == ("error", "deadline", "yes"), end
+        assert "blocked" in end.text and took < DEADLINE + LATE, (took, end.text)
+        await gone(operator, int(mark.read_text()))
+    assert (await operator.call("add", a=1)).values == {"sum": 2}
+    assert (await operator.call("eye_pid")).status == "success"
+    assert (await operator.call("go", to=0.0)).status == "success"
+
+
+@pytest.mark.parametrize("how", WAYS)
+async def test_what_a_crashed_worker_left_ends_with_it(operator: Operator, tmp_path: Path, how: str) -> None:
+    for service in PLACES:
+        mark = tmp_path / f"{service} {how}"
+        end = await operator.call(service, PATIENCE, how=how, mark=str(mark), then="crash")
+        assert (end.cause, end.executed) == ("worker_died", "unknown") and "SIGSEGV" in end.text
+        await gone(operator, int(mark.read_text()))
+
+
+@pytest.mark.parametrize("way", ["worker killed", "node killed", "node stopped"])
+async def test_what_an_action_left_lives_as_long_as_its_worker(nodes: Nodes, tmp_path: Path, way: str) -> None:
+    async with operator_of(nodes.directory, "left", "right") as operator:
+        left, workers = [], []
+        for how in WAYS:
+            for service in PLACES:
+                mark = tmp_path / f"{service} {how}"
+                end = await operator.call(service, PATIENCE, how=how, mark=str(mark))
+                assert end.status == "success", end
+                left.append(int(mark.read_text()))
+                workers.append(end.values["pid"])
+        assert all(map(alive, left)), "an action that ends well keeps what it has started"
+        if way == "worker killed":
+            for worker in set(workers):
+                os.kill(worker, signal.SIGKILL)
+        elif way == "node stopped":
+            assert await asyncio.to_thread(nodes.stop) == {"left": 0, "right": 0}
+        else:
+            for node in nodes.processes.values():
+                node.kill()
+        for process in (*left, *workers):
+            await gone(operator, process)
+
+
+async def test_an_action_that_closes_its_pipe_ends_alone(operator: Operator, tmp_path: Path) -> None:
+    for then in ("block", "return"):
+        mark = tmp_path / then
+        began = time.monotonic()
+        end = await operator.call("leave_behind", 30.0, how="no pipe", mark=str(mark), then=then)
+        assert (end.status, end.cause) == ("error", "worker_died"), end
+        assert time.monotonic() - began < LATE
+        await gone(operator, int(mark.read_text()))
+    assert (await operator.call("add", a=1)).values == {"sum": 2}
+
+
+async def test_a_copy_that_returns_from_the_action_does_nothing_more(operator: Operator, tmp_path: Path) -> None:
+    for number, service in enumerate(PLACES):
+        mark = tmp_path / f"{number}"
+        end = await operator.call(service, 10.0, how="fork that returns", mark=str(mark))
+        assert (end.status, end.values["pid"]) == ("success", int(mark.read_text()))
+    assert (await operator.call("add", a=1)).values == {"sum": 2}
+    assert (await operator.call("go", to=0.5)).status == "success", "a copy has stopped the device, or taken its link"
+
+
+async def test_a_stopped_worker_is_killed_at_the_deadline(operator: Operator) -> None:
+    for service, arguments, node, device in (
+        ("nap", {"seconds": 60.0}, "left", ""),
+        ("go", {"to": 90.0, "timeout": 60.0}, "left", "slide"),
+    ):
+        running = asyncio.create_task(operator.call(service, DEADLINE, **arguments))
+        await passing(0.3)
+        os.kill((await pids(operator, node, device))["actions"], signal.SIGSTOP)
+        end = await running
+        assert (end.cause, end.executed) == ("deadline", "yes") and "answered nothing" in end.text
+    assert (await operator.call("go", to=0.0)).status == "success"
+
+
+async def test_one_that_blocks_and_one_that_crashes_end_alone(operator: Operator) -> None:
+    # The workers are started beforehand: how long that takes on a busy host is not what this is about.
+    assert {run.status for run in await asyncio.gather(*(operator.call("nap", seconds=1.0) for _ in range(5)))} == {
+        "success"
+    }
+    naps = [asyncio.create_task(operator.call("nap", 20.0, seconds=2.5)) for _ in range(3)]
+    began = time.monotonic()
+    blocking = asyncio.create_task(operator.call("block", DEADLINE, seconds=30.0))
+    crashing = asyncio.create_task(operator.call("segfault", 20.0))
+    end = await blocking
+    assert time.monotonic() - began < DEADLINE + LATE
+    assert (end.cause, end.executed) == ("deadline", "yes") and "blocked" in end.text, end
+    assert ((await crashing).cause, (await crashing).executed) == ("worker_died", "unknown")
+    assert [(await nap).status for nap in naps] == ["success"] * 3
+
+
+async def test_at_the_limit_a_run_is_refused_and_says_so(operator: Operator) -> None:
+    naps = [asyncio.create_task(operator.call("nap", 60.0, seconds=8.0)) for _ in range(6)]
+
+    async def full() -> bool:
+        status = await operator.command("left", "status")
+        return bool(status.data["answers"]["left"] == "busy")
+
+    await operator.until(full)
+    refused = await operator.call("add", a=1)
+    assert (refused.status, refused.cause, refused.executed) == ("error", "busy", "no") and "workers" in refused.text
+    assert [(await nap).status for nap in naps] == ["success"] * 6
+    assert (await operator.call("add", a=1)).values == {"sum": 2}
+    status = await operator.command("left", "status")
+    assert status.data["answers"]["left"] == "up" and len(status.data["devices"]["left"]["pids"]) == 6
+
+
+async def test_too_much_memory_ends_one_run_and_no_other(operator: Operator) -> None:
+    nap = asyncio.create_task(operator.call("nap", 20.0, seconds=1.0))
+    before = await operator.call("pid")
+    end = await operator.call("eat", 20.0, megabytes=4000)
+    assert (end.status, end.cause, end.executed) == ("error", "out_of_memory", "yes"), end
+    kept = await operator.call("keep_memory", 20.0)
+    assert (kept.status, kept.cause) == ("error", "out_of_memory"), kept
+    assert (await nap).status == "success"
+    assert (await operator.call("eat", megabytes=600)).values == {"bytes": 600 << 20}, "the memory of another run"
+    assert (await operator.call("pid")).values != before.values
+
+
+async def test_hold_and_stop_reach_all_runs_without_a_device(operator: Operator) -> None:
+    naps = [asyncio.create_task(operator.call("nap", 20.0, seconds=1.0)) for _ in range(2)]
+    await passing(0.2)
+    assert (await operator.command("left", "hold")).data["answers"]["left"] == "held"
+    late = asyncio.create_task(operator.call("nap", 20.0, seconds=0.1))
+    await passing(2.0)
+    assert not any(nap.done() for nap in [*naps, late]), "a held run has ended"
+    assert (await operator.command("left", "release")).data["answers"]["left"] == "released"
+    assert [(await nap).status for nap in [*naps, late]] == ["success"] * 3
+    assert (await operator.command("left", "hold")).data["answers"]["left"] == "held"
+    held = asyncio.create_task(operator.call("nap", 20.0, seconds=0.1))
+    blocked = asyncio.create_task(operator.call("block", 60.0, seconds=30.0))
+    await passing(0.5)
+    assert (await operator.command("left", "stop")).ok
+    assert [(await run).cause for run in (held, blocked)] == ["stopped"] * 2
+    assert (await operator.call("add", a=1)).values == {"sum": 2}

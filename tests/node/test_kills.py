@@ -1,0 +1,159 @@
+"""Processes of a cyclic device are killed at random moments, under load: each time it is up again, and takes runs."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import random
+import select
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.node.test_processes import ROOT, Nodes, Operator, operator_of, pids
+
+pytestmark = pytest.mark.processes
+RECOVERY = 60.0
+"""Seconds within which the device must be up again, on a host as busy as this."""
+HOWS = ("SIGKILL", "SIGSEGV", "SIGSTOP, then SIGKILL")
+VICTIMS = (("driver",), ("actions",), ("driver", "actions"))
+CALLS = 10
+"""Calls that must succeed after each kill."""
+WRONG_HASTE = 0.3
+"""Share of kills that come while the processes are being started again after the one before."""
+
+
+@contextmanager
+def load() -> Iterator[None]:
+    """Keep both cores busy."""
+    burn = "import os\nparent = os.getppid()\nwhile os.getppid() == parent:\n    sum(range(100000))"
+    burners = [subprocess.Popen([sys.executable, "-c", burn]) for _ in range(2)]
+    try:
+        yield
+    finally:
+        for burner in burners:
+            burner.kill()
+            burner.wait()
+
+
+@dataclass
+class Tally:
+    """What was done, and what came of it."""
+
+    kills: dict[str, int] = field(default_factory=dict)
+    calls: int = 0
+    wedged: list[str] = field(default_factory=list)
+
+
+async def up(operator: Operator, former: set[int]) -> bool:
+    """Whether the node says that the device is up, by processes that were not killed."""
+    answer = await operator.command("left", "status", "slide")
+    found = answer.data["devices"].get("slide", {}).get("pids", {})
+    return answer.data["answers"]["slide"] == "up" and former.isdisjoint(found.values())
+
+
+async def kill(operator: Operator, chance: random.Random, tally: Tally) -> set[int]:
+    """Kill one process of the device or both in one of the ways; return which."""
+    found = await pids(operator, "left", "slide")
+    chosen, how = chance.choice(VICTIMS), chance.choice(HOWS)
+    victims = {found[name] for name in chosen if name in found}
+    for name in how.split(", then "):
+        for victim in victims:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(victim, getattr(signal, name))
+        if name == "SIGSTOP":
+            await passing(chance.uniform(0.0, 0.3))
+    label = f"{how} of {' and '.join(chosen)}"
+    tally.kills[label] = tally.kills.get(label, 0) + bool(victims)
+    return victims
+
+
+async def passing(seconds: float) -> None:
+    """Let time pass."""
+    await asyncio.to_thread(select.select, [], [], [], seconds)
+
+
+async def storm(folder: Path, seed: int, kills: int) -> Tally:
+    """So many kills, each but the hasty ones followed by calls that all must succeed."""
+    chance, tally = random.Random(seed), Tally()
+    running = Nodes(folder, "left")
+    try:
+        with load():
+            async with operator_of(running.directory, "left") as operator:
+                killed: set[int] = set()
+                for number in range(kills):
+                    moving = asyncio.create_task(operator.call("go", to=chance.uniform(-2.0, 2.0), timeout=30.0))
+                    await passing(chance.uniform(0.0, 0.4))
+                    killed |= await kill(operator, chance, tally)
+                    await moving
+                    if chance.random() < WRONG_HASTE and number < kills - 1:
+                        continue
+                    try:
+                        await operator.until(partial(up, operator, killed), RECOVERY)
+                    except TimeoutError:
+                        tally.wedged.append(f"kill {number}: {(await operator.command('left', 'status')).data}")
+                        break
+                    for call in range(CALLS):
+                        end = await operator.call("go", to=0.1 * (call % 2), timeout=30.0)
+                        tally.calls += 1
+                        if end.status != "success":
+                            tally.wedged.append(f"kill {number}, call {call}: {end.cause}: {end.text}")
+    finally:
+        running.stop()
+    return tally
+
+
+async def test_a_device_outlives_kills_of_its_processes(tmp_path: Path) -> None:
+    tally = await storm(tmp_path, 5, 10)
+    assert not tally.wedged and sum(tally.kills.values()) >= 8 and tally.calls >= 5 * CALLS, tally
+
+
+@pytest.mark.proof
+async def test_a_device_outlives_two_hundred_kills_of_its_processes(tmp_path: Path) -> None:
+    tally = await storm(tmp_path, 11, 240)
+    print(tally.kills, tally.calls)
+    assert not tally.wedged and sum(tally.kills.values()) >= 200, tally
+
+
+async def test_petrobot_nodes_says_up_only_when_a_call_would_be_taken(tmp_path: Path) -> None:
+    running = Nodes(tmp_path, "left")
+    try:
+        async with operator_of(running.directory, "left") as operator:
+            assert (await asyncio.to_thread(nodes_command, running.file))["left"]["up"]
+            driver = (await pids(operator, "left", "slide"))["driver"]
+            os.kill(driver, signal.SIGSTOP)
+            frozen = (await asyncio.to_thread(nodes_command, running.file))["left"]
+            assert (frozen["up"], frozen["not_ready"]) == (False, {"slide": "no answer"})
+            os.kill(driver, signal.SIGKILL)
+            seen = set()
+
+            async def up_again() -> bool:
+                left = (await asyncio.to_thread(nodes_command, running.file))["left"]
+                seen.update(left.get("not_ready", {}).values())
+                return bool(left["up"]) and (await pids(operator, "left", "slide"))["driver"] != driver
+
+            await operator.until(up_again, RECOVERY)
+            assert (await operator.call("go", to=0.0)).status == "success"
+            told = "restarting: the process of its driver died: it was ended by SIGKILL"
+            assert seen <= {told, "no answer", "not ready: " + told.partition(": ")[2]}, seen
+    finally:
+        running.stop()
+
+
+def nodes_command(file: Path) -> dict[str, Any]:
+    """What `petrobot nodes` says."""
+    command = [sys.executable, "-m", "coordinator", "nodes", "--services", str(file), "--json", "-"]
+    said = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=RECOVERY)
+    answers: dict[str, Any] = json.loads(said.stdout)
+    assert said.returncode == (0 if all(answer["up"] for answer in answers.values()) else 3), said.stderr
+    return {name: answer for name, answer in answers.items() if name == "left"}

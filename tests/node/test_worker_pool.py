@@ -1,0 +1,213 @@
+"""Actions without a device: each run has a worker of its own, workers are started as needed and let go, and every run ends once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from services.runs import Answered, Asked, Begin, Ended, Hold, Stop, Told, flat
+from services.worker import COMMAND, STREAM_AT, WANTED, Setup
+from services.worker_pool import IDLE_LIMIT, KEPT, WorkerPool
+from tests.node.conftest import Clock
+from tests.node.test_worker_place import FakeChild
+
+
+class Pool:
+    """A pool whose workers are fake."""
+
+    def __init__(self, most: int = 4) -> None:
+        self.clock = Clock(100.0)
+        self.children: list[FakeChild] = []
+        self.wanted: list[str] = []
+        self.reports: list[Any] = []
+        self.pool = WorkerPool(
+            Setup("services.toml", "", "node", ""),
+            clock=self.clock,
+            changed=lambda: None,
+            wanted=self.wanted.append,
+            spawn=self._spawn,
+            most=most,
+        )
+        self.pool.start()
+
+    def _spawn(self, *arguments: Any) -> Any:
+        self.children.append(FakeChild(*arguments))
+        return self.children[-1]
+
+    def living(self) -> list[FakeChild]:
+        return [child for child in self.children if not child.dead]
+
+    def make_ready(self) -> None:
+        for child in self.living():
+            child.ready()
+
+    def begin(self, identity: str, deadline: float | None = None) -> None:
+        self.pool.take(self.clock.now, Begin(identity, "act", {}, deadline))
+
+    def of(self, identity: str) -> FakeChild:
+        """The worker that was given a run."""
+        (child,) = [c for c in self.children if identity in {o.id for o in c.orders() if isinstance(o, Begin)}]
+        return child
+
+    def run(self, seconds: float = 0.0) -> list[Any]:
+        until, fresh = self.clock.now + seconds, []
+        while True:
+            self.pool.advance(self.clock.now)
+            fresh += self.pool.reports()
+            due = self.pool.due()
+            if due is None or due > until:
+                break
+            self.clock.now = max(due, self.clock.now + 1e-6)
+        self.clock.now = max(until, self.clock.now)
+        self.reports += fresh
+        return fresh
+
+    def answer(self, verb: str) -> Told | None:
+        self.pool.command(self.clock.now, verb, verb)
+        return next((report for report in self.run() if isinstance(report, Told)), None)
+
+
+def test_runs_have_a_worker_each_and_one_more_waits() -> None:
+    bench = Pool()
+    bench.make_ready()
+    bench.begin("a")
+    assert len(bench.children) == 2, "the next run should find a worker that is up"
+    bench.make_ready()
+    bench.begin("b")
+    assert bench.of("a") is bench.children[0] and bench.of("b") is bench.children[1]
+    bench.of("a").say(flat(Ended("a", "success")))
+    bench.run()
+    bench.begin("c")
+    assert bench.of("c") is bench.children[0], "the first worker is used again"
+
+
+def test_the_death_of_one_worker_ends_its_run_alone() -> None:
+    bench = Pool()
+    bench.make_ready()
+    bench.begin("a")
+    bench.make_ready()
+    bench.begin("b")
+    bench.of("a").die(-11)
+    assert [(r.id, r.cause) for r in bench.run()] == [("a", "worker_died")]
+    bench.of("b").say(flat(Ended("b", "success")))
+    assert [(r.id, r.status) for r in bench.run()] == [("b", "success")]
+
+
+def test_beyond_the_limit_a_run_is_busy() -> None:
+    bench = Pool(most=2)
+    bench.make_ready()
+    for identity in ("a", "b", "c"):
+        bench.begin(identity)
+    assert [(r.id, r.cause, r.executed) for r in bench.run()] == [("c", "busy", "no")]
+    told = bench.answer("status")
+    assert told is not None and told.answer == "busy" and len(bench.children) == 2
+
+
+def test_idle_workers_retire_but_a_few() -> None:
+    bench = Pool(most=6)
+    for identity in "abcd":
+        bench.begin(identity)
+    bench.make_ready()
+    for identity in "abcd":
+        bench.of(identity).say(flat(Ended(identity, "success")))
+    bench.run(IDLE_LIMIT - 1.0)
+    assert not any(child.left for child in bench.children)
+    bench.run(2.0)
+    left = [child for child in bench.children if child.left]
+    assert len(bench.children) - len(left) == KEPT and not bench.children[0].left
+    assert len(bench.pool.children()) == len(bench.children), "the node waits for those, too"
+    for child in left:
+        child.die(0)
+    bench.run()
+    assert len(bench.pool.children()) == KEPT
+
+
+def test_answers_and_addresses_go_to_the_worker_that_asked() -> None:
+    bench = Pool()
+    bench.make_ready()
+    bench.begin("a")
+    bench.make_ready()
+    bench.begin("b")
+    a, b = bench.of("a"), bench.of("b")
+    b.say(flat(Asked("b", "b/1", "service")))
+    b.say([WANTED, "points"])
+    bench.run()
+    bench.pool.take(0.0, Answered("b/1", "success"))
+    bench.pool.stream_at("points", "h", 1, "t")
+    assert bench.wanted == ["points"]
+    assert b.got[-2:] == [flat(Answered("b/1", "success")), [STREAM_AT, "points", "h", 1, "t"]]
+    assert not [items for items in a.got if items[0] in (STREAM_AT, "answered")]
+
+
+def test_a_command_is_answered_once_by_all_that_run() -> None:
+    bench = Pool()
+    bench.make_ready()
+    assert bench.answer("picture") is not None and bench.answer("stop") is not None
+    bench.begin("a")
+    bench.make_ready()
+    bench.begin("b")
+    assert bench.answer("hold") is None
+    bench.of("a").say(flat(Told("hold", "held")))
+    assert not [r for r in bench.run() if isinstance(r, Told)]
+    bench.of("b").say(flat(Told("hold", "held")))
+    assert [(r.id, r.answer) for r in bench.run() if isinstance(r, Told)] == [("hold", "held")]
+    bench.make_ready()
+    bench.begin("late")
+    got = [items for items in bench.of("late").got if items[0] in (COMMAND, "begin", "hold")]
+    assert got[0][:3] in ([COMMAND, "", "hold"], flat(Hold(True))) and got[1][0] == "begin", "it begins held"
+    told = bench.answer("status")
+    assert told is not None and (told.answer, set(told.data["runs"])) == ("up", {"a", "b", "late"})
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    acts=st.lists(
+        st.tuples(
+            st.sampled_from(["begin", "stop", "end", "die", "ready", "hold", "release", "stop all", "wait"]),
+            st.integers(0, 7),
+        ),
+        max_size=40,
+    )
+)
+def test_every_run_ends_once_and_the_pool_takes_runs_again(acts: list[tuple[str, int]]) -> None:
+    bench = Pool()
+    begun: list[str] = []
+    for act, number in acts:
+        living = bench.living()
+        child = living[number % len(living)] if living else None
+        if act == "begin":
+            begun.append(f"r{len(begun)}")
+            bench.begin(begun[-1], 5.0)
+        elif act == "stop" and begun:
+            bench.pool.take(bench.clock.now, Stop(begun[number % len(begun)]))
+        elif act == "end" and child:
+            for order in child.orders():
+                if isinstance(order, Begin):
+                    child.say(flat(Ended(order.id, "success")))
+        elif act == "die" and child:
+            child.die()
+        elif act == "ready":
+            bench.make_ready()
+        elif act in ("hold", "release", "stop all"):
+            verb = act.partition(" ")[0]
+            bench.pool.command(bench.clock.now, verb, verb)
+            for each in living:
+                if [COMMAND, verb, verb] in each.got:
+                    each.say(flat(Told(verb, "held" if verb == "hold" else "done")))
+        elif act == "wait":
+            bench.run(1.0)
+        bench.run()
+    bench.pool.command(bench.clock.now, "last release", "release")
+    for _ in range(30):
+        for each in bench.living():
+            if each.killed or each.left:
+                each.die()
+        bench.make_ready()
+        bench.run(2.0)
+    ends = [report.id for report in bench.reports if isinstance(report, Ended)]
+    assert sorted(ends) == sorted(begun)
+    assert bench.pool.ready and bench.pool.condition == ("up", "")
+    bench.begin("last")
+    assert bench.of("last") in bench.living()
