@@ -50,6 +50,7 @@ class Pipe:
 
     def read(self) -> list[list[Any]]:
         """All lists that have come."""
+        items: list[list[Any]] = []
         with contextlib.suppress(BlockingIOError):
             while not self.closed:
                 try:
@@ -60,7 +61,9 @@ class Pipe:
                     self.closed = True
                     break
                 self._unpacker.feed(data)
-        return [item for item in self._unpacker if isinstance(item, list)]
+                # Taken out before more is read: several large records that came together are more than its buffer holds.
+                items += [item for item in self._unpacker if isinstance(item, list)]
+        return items
 
     def close(self) -> None:
         """Let it go."""

@@ -119,7 +119,8 @@ class WorkerPlace:
         self._started, self._restart_at = self._clock(), None
         if self._setup.device and self._owner is None:
             self._owner = self._spawn(self._setup, self._heard_owner, self._owner_ended, None)
-        elif self._worker is None:
+        elif self._worker is None and (self._cyclic or not self._setup.device):
+            # A driver that is only being started gets its worker when it is ready: two of them would take each other's link.
             self._start_worker()
 
     def _start_worker(self) -> None:
@@ -157,7 +158,8 @@ class WorkerPlace:
 
     def _heard(self, items: list[Any]) -> None:
         if items[0] == FAILED:
-            self.failed = items[1]
+            # It is about to end: what is ordered now waits for its successor.
+            self.failed, self._ready = items[1], False
         elif items[0] == PONG:
             for run in self._runs.values():
                 run.pong = run.pong or run.stop is not None
@@ -188,7 +190,7 @@ class WorkerPlace:
 
     def _owner_ended(self) -> None:
         assert self._owner is not None
-        why = self._owner.describe()
+        why = self.failed or self._owner.describe()
         alone = self._owner is self._worker or self._worker is None
         self._owner, self._ready, self._cyclic, self.streams = None, False, False, {}
         if alone:

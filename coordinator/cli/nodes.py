@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
@@ -74,12 +74,30 @@ def _print(answers: dict[str, Any]) -> None:
     Console().print(table)
 
 
-def _devices(devices: Iterable[str], stopped: Sequence[str]) -> str:
-    """Names of devices, each that an emergency stop holds with what to do about it."""
-    return ", ".join(
-        f"{device} [red]stopped (petrobot estop --clear)[/]" if device in stopped else device
-        for device in dict.fromkeys((*devices, *stopped))
-    )
+def _devices(devices: Mapping[str, Any], stopped: Sequence[str]) -> str:
+    """Names of devices, each with what is wrong with it: an emergency stop, refused commands, missed cycles, no answer."""
+    shown = []
+    for device in dict.fromkeys((*devices, *stopped)):
+        said = [device]
+        if device in stopped:
+            said.append("[red]stopped (petrobot estop --clear)[/]")
+        said += _troubles(devices.get(device, {}))
+        shown.append(" ".join(said))
+    return ", ".join(shown)
+
+
+def _troubles(told: Mapping[str, Any]) -> list[str]:
+    """What a device's own status says against it. Its text may come from a driver, so it is escaped."""
+    from rich.markup import escape
+
+    found = []
+    if told.get("refused"):
+        found.append(f"[yellow]{told['refused']} refused[/]")
+    if told.get("overruns"):
+        found.append(f"[yellow]{told['overruns']} cycles missed, at most {told.get('late_ms', 0.0):.0f} ms late[/]")
+    if told.get("text"):
+        found.append(f"[red]{escape(str(told['text']))}[/]")
+    return found
 
 
 def _ends(ends: str) -> str:
