@@ -20,6 +20,7 @@ from services.lockstep_node import LockstepNode
 from services.scripted import ScriptError
 from services.scripted import load as load_script
 from services.shell import serve
+from services.worker import log_to_stderr
 
 EXAMPLE = "example:\n  python -m services vision --services services.toml"
 
@@ -66,6 +67,7 @@ def read(path: Path, name: str) -> tuple[Directory, str]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the node; gives the exit code."""
     options = parser().parse_args(arguments)
+    log_to_stderr()
     try:
         directory, text = read(options.services, options.name)
         if options.mock:

@@ -1,8 +1,11 @@
-"""Actions as Python callables: arguments checked against their signature, what they raise described in one line."""
+"""Code of users as Python callables: arguments checked against their signature, what they raise described in one line."""
 
 from __future__ import annotations
 
+import dis
 import inspect
+import signal
+import threading
 import traceback
 from collections.abc import Callable, Mapping
 from functools import lru_cache
@@ -11,8 +14,23 @@ from typing import Any
 
 _OURS = {
     str(Path(__file__).with_name(name))
-    for name in ("runner.py", "execution.py", "context.py", "outlets.py", "callables.py")
+    for name in (
+        "runner.py",
+        "execution.py",
+        "context.py",
+        "outlets.py",
+        "callables.py",
+        "remote.py",
+        "place.py",
+        "device.py",
+        "drivers.py",
+        "device_process.py",
+        "inline_service.py",
+    )
 }
+LONGEST = 2_000
+"""Characters of a description: what an exception says may be as long as what it is about."""
+_RAISE = dis.opmap["RAISE_VARARGS"]
 
 
 @lru_cache(maxsize=4096)
@@ -35,8 +53,35 @@ def check_arguments(function: Callable[..., Any], arguments: Mapping[str, Any]) 
             raise TypeError(f"needs the argument {name!r}; give it as args in services.toml or in the task")
 
 
+def words_of(fault: BaseException) -> str:
+    """The message of an exception as a text that can always be sent: cut at `LONGEST` characters, and what is not Unicode
+    escaped."""
+    try:
+        said = str(fault)
+    except Exception as worse:
+        said = f"(its message cannot be had: {type(worse).__name__})"
+    if len(said) > LONGEST:
+        said = f"{said[:LONGEST]}... ({len(said):,} characters)"
+    return said.encode("utf-8", "backslashreplace").decode()
+
+
 def describe(fault: BaseException) -> str:
-    """Type and message of an exception and the last three places of the action's own code that it came through."""
+    """Type and message of an exception and the last three places of the user's own code that it came through."""
     frames = [f for f in traceback.extract_tb(fault.__traceback__) if f.filename not in _OURS][-3:]
     places = " < ".join(f"{f.name} ({Path(f.filename).name}:{f.lineno})" for f in reversed(frames))
-    return f"{type(fault).__name__}: {fault}" + (f" in {places}" if places else "")
+    return f"{type(fault).__name__}: {words_of(fault)}" + (f" in {places}" if places else "")
+
+
+def from_outside(fault: BaseException) -> bool:
+    """Whether the exception is the Ctrl-C of a person at a terminal, and no doing of the code that it hit.
+
+    Python raises KeyboardInterrupt for it wherever the main thread is; code that raises one itself does it by a `raise`.
+    """
+    if not isinstance(fault, KeyboardInterrupt) or threading.current_thread() is not threading.main_thread():
+        return False
+    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        return False  # a worker ignores the signal, a node takes it in its loop
+    place = fault.__traceback__
+    while place is not None and place.tb_next is not None:
+        place = place.tb_next
+    return place is None or place.tb_frame.f_code.co_code[place.tb_lasti] != _RAISE

@@ -10,8 +10,12 @@ from typing import Any
 import numpy as np
 
 from services.action import Result, Status, Wait
+from services.callables import describe, words_of
+from services.comm.codec import ProtocolError, encode
+from services.comm.frequent import NAME_LENGTH
+from services.comm.messages import Call, Event, Feedback, Message, Outcome
 from services.comm.plain import plain
-from services.comm.verdicts import mission_of
+from services.comm.verdicts import VerdictSaid, mission_of, verdict_event
 from services.outlets import Outlets
 from services.runs import Answered, Asked, Begin, Dropped, Judged, Progressed, Raised, Report
 
@@ -27,6 +31,34 @@ class CallFailed(Exception):  # noqa: N818 - what happened, not a class of error
 def never() -> bool:
     """What a run waits for that only waits for time."""
     return False
+
+
+def checked(message: Message) -> None:
+    """Refuse what no peer would take, where the value is made: later it could only cost the connection. Raises ValueError."""
+    try:
+        encode(message)
+    except ProtocolError as fault:
+        raise ValueError(fault.text) from None
+
+
+def checked_result(identity: str, returned: Any, where: str = "result") -> Result:
+    """What an action or a service returned as a result in plain data that can be sent. Raises ValueError for any other, naming
+    its values as `where` says."""
+    if not isinstance(returned, Result):
+        name = type(returned).__name__
+        raise ValueError(f"returned a {name}; return success(), failure() or error()")
+    try:
+        values = plain(returned.values, where)
+        if type(values) is not dict:
+            raise ValueError(f"{where}: expected values by name, found a {type(values).__name__}")
+        said = (plain(str(returned.cause)), plain(str(returned.text)), bool(returned.deferred))
+        result = Result(Status(returned.status), values, *said)
+        checked(Outcome(identity, result.status, values, result.cause, result.text, deferred=result.deferred))
+    except (TypeError, ValueError, MemoryError) as fault:
+        raise ValueError(words_of(fault) or type(fault).__name__) from None
+    except Exception as fault:  # the value's own code: an object may raise whatever is asked of it
+        raise ValueError(f"its values cannot be read: {describe(fault)}") from None
+    return result
 
 
 class RunContext:
@@ -85,24 +117,39 @@ class RunContext:
 
     def raise_event(self, name: str, **data: Any) -> None:
         """Raise a named internal event while the run goes on."""
-        self._report(Raised(self.run, name, plain(data, "data")))
+        raised = Raised(self.run, plain(name, "name"), plain(data, "data"))
+        checked(Event(raised.name, self._begin.action, 1, raised.data, self.run))
+        self._report(raised)
 
     def verdict(self, run: str, status: Status, cause: str = "", text: str = "") -> None:
         """Judge an earlier run that had ended provisionally. Raises ValueError for what is no run's id or no status."""
-        mission_of(run)
-        self._report(Judged(self.run, run, Status(status).value, str(cause), str(text)))
+        said = VerdictSaid(run, Status(status).value, str(cause), str(text))
+        name = verdict_event(mission_of(run))
+        checked(Outcome(run, said.status, cause=said.cause, text=said.text))
+        checked(Event(name, self._begin.action, 1, said.to_data()))
+        self._report(Judged(self.run, run, said.status, said.cause, said.text))
 
     def progress(self, fraction: float, **data: Any) -> None:
         """Tell how far the run is, 0 to 1 (clipped)."""
         if not math.isfinite(fraction):
             raise ValueError(f"progress is {fraction}; give a number from 0 to 1")
-        self._report(Progressed(self.run, min(1.0, max(0.0, float(fraction))), plain(data, "data")))
+        progressed = Progressed(self.run, min(1.0, max(0.0, float(fraction))), plain(data, "data"))
+        checked(Feedback(self.run, progressed.fraction, progressed.data))
+        self._report(progressed)
 
     async def call(self, service: str, /, deadline: float | None = None, **arguments: Any) -> Result:
-        """Call any network service by its name; a call still open when the run is cancelled is cancelled with it."""
+        """Call any network service by its name; a call still open when the run is cancelled is cancelled with it. Raises
+        ValueError or TypeError for what cannot be sent."""
         self._children += 1
         child = f"{self.run}/{self._children}"
-        self._report(Asked(self.run, child, service, plain(arguments, "arguments"), deadline, self._begin.seed))
+        limit = None if deadline is None else float(deadline)
+        asked = Asked(
+            self.run, child, plain(service, "service"), plain(arguments, "arguments"), limit, self._begin.seed
+        )
+        # The node adds the boot of its peer: as long as any name of it, so that what passes here passes there.
+        boot = "b" * NAME_LENGTH
+        checked(Call(child, asked.service, asked.arguments, limit, 0, boot, self.run, self._begin.seed))
+        self._report(asked)
         self._waiting.add(child)
         try:
             await Wait(lambda: child in self._answers)

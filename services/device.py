@@ -8,12 +8,16 @@ so no user code delays it; actions see a `Remote` of it: `send` a command, read 
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Collection, Mapping
 from typing import Any, Protocol, runtime_checkable
 
 from services.comm.canbus import CanBus
 from services.comm.directory_file import nearest
 from services.comm.image import ImageSource
+from services.comm.plain import plain
+
+_log = logging.getLogger(__name__)
 
 
 class Setpoint(Protocol):
@@ -73,13 +77,18 @@ def refuse_unknown_keys(config: Mapping[str, Any], own: Collection[str]) -> None
 
 
 class Driver(Protocol):
-    """One device. Nothing here blocks; `now` is the cell's clock (s)."""
+    """One device. Nothing here blocks; `now` is the cell's clock (s).
+
+    A method that raises has broken the driver, but for `command` (which refuses so) and `picture`: the device is stopped, its
+    run ends in ERROR with the exception's words, the traceback goes to the node's log, and the driver is made again.
+    """
 
     period: float | None
     """Seconds between calls of `step`; None for a driver without cyclic duty."""
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
-        """Take a command from an action (cyclic drivers). A bad one raises ValueError."""
+        """Take a command from an action (cyclic drivers). A bad one raises ValueError: it is refused, and ends its run in ERROR
+        with these words unless the action reads them in `Remote.refused`. Any other exception refuses it, too."""
 
     def step(self, now: float) -> None:
         """One cycle (cyclic drivers)."""
@@ -125,8 +134,13 @@ class Watched(Protocol):
 
 
 def picture_of(driver: Driver | None) -> Mapping[str, Any]:
-    """The picture of a device, empty for one that has none."""
-    return driver.picture() if isinstance(driver, Watched) else {}
+    """The picture of a device, empty for one that has none. One that cannot be had goes to the log: the device moves on."""
+    try:
+        picture: Mapping[str, Any] = plain(driver.picture(), "picture") if isinstance(driver, Watched) else {}
+    except Exception:
+        _log.exception("a driver gives no picture")
+        return {}
+    return picture
 
 
 def stop_at_once(driver: Driver, now: float) -> None:
@@ -149,7 +163,8 @@ class Remote(Protocol):
 
     @property
     def refused(self) -> str:
-        """Why the last command was refused; empty if it was not."""
+        """Why the last command was refused; empty if it was not. A refusal that the action does not read ends its run in
+        ERROR, cause `command_refused`."""
 
     @property
     def state(self) -> Mapping[str, Any]:

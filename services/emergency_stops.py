@@ -1,14 +1,60 @@
-"""Devices of a node that were stopped in an emergency and obey nobody, as the latch on disk says and keeps it."""
+"""Devices of a node that were stopped in an emergency and obey nobody, as the latch on disk says and keeps it.
+
+The node looks at the latch, and so does each process that has a driver: a node that is frozen, or whose loop is blocked, can
+stop nothing.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
 
 from services.comm.latch import ALL, Latch, LatchError
+from services.remote import EMERGENCY_STOP, NODE_SILENT
 
 LOOK = 0.25
 """Seconds between looks at the latch: somebody may have set it in this node's place while it could not be asked."""
 NEVER = float("inf")
+BEAT = "beat"
+"""What a node says to its processes every `BEAT_EVERY` seconds, so that they know that its loop runs."""
+BEAT_EVERY = 0.2
+SILENCE = 0.8
+"""Seconds without any word of the node after which its processes stop their devices: with the time that a stop takes to get to
+the drives that is less than a second."""
+AGAIN = 0.2
+"""Seconds that a silent node gets to be heard after this process itself stood still."""
+GUARD_LOOK = 0.05
+"""Seconds between looks of a process at the latch and at its node's silence."""
+
+
+class Guard:
+    """What a process with a driver watches by itself: the latch of its node, and whether its node speaks.
+
+    Silence counts from the node's first beat on. A process that was not scheduled itself for a while gives its node another
+    moment: what that one said meanwhile still has to be read.
+    """
+
+    def __init__(self, device: str, latch: Latch) -> None:
+        self.due = 0.0
+        """When to look next (s)."""
+        self._device = device
+        self._latch = latch
+        self._heard = NEVER
+        """When the node last said something (s)."""
+
+    def heard(self, now: float, beat: bool) -> None:
+        """The node has said something, and whether it was a beat."""
+        if beat or self._heard < NEVER:
+            self._heard = now
+
+    def look(self, now: float) -> str:
+        """Cause for which the device must stand: EMERGENCY_STOP, NODE_SILENT, or empty. Call it when `due`, after reading."""
+        if now - self.due > SILENCE / 2 and self._heard < NEVER:  # as the heart of a link does
+            self._heard = max(self._heard, now - SILENCE + AGAIN)
+        self.due = now + GUARD_LOOK
+        stopped = self._latch.stopped()
+        if self._device in stopped or ALL in stopped:
+            return EMERGENCY_STOP
+        return NODE_SILENT if now - self._heard >= SILENCE else ""
 
 
 class EmergencyStops:

@@ -11,8 +11,8 @@ from enum import Enum, auto
 from functools import partial
 from typing import Any
 
-from services.action import Cancelled, Result, Wait
-from services.callables import describe
+from services.action import Result, Wait
+from services.callables import describe, from_outside
 from services.comm.directory import ActionEntry
 from services.context import RunContext, never
 from services.runs import Begin
@@ -28,10 +28,19 @@ class Phase(Enum):
     RUNNING = auto()
     COMPUTED = auto()
     """Its result waits for the declared computing time."""
+    TAKING = auto()
+    """Its result waits until the driver has taken all commands: one of them may be refused."""
     STOPPING = auto()
     """Its coroutine cleans up after a cancel."""
     SETTLING = auto()
     """Its coroutine is over; its device must come to a standstill."""
+
+
+class Hung(BaseException):
+    """Raised by the watchdog of lock step into code that has not come back for too long."""
+
+    def __str__(self) -> str:
+        return "did not come back in time; an action waits with ctx.wait or ctx.sleep, and loops that do not end are faults"
 
 
 class Returned(Exception):  # noqa: N818 - not an error
@@ -56,7 +65,9 @@ class Execution:
     limit: float | None = None
     """When the phase is over at the latest."""
     ready_at: float = 0.0
-    """When its computed result is out."""
+    """When its computed result is out, or is given up because the driver takes no commands."""
+    sent_before: int = 0
+    """Number of the last command that its device was sent before it began."""
     cpu: float = 0.0
     result: Result | None = None
     cause: str = ""
@@ -74,14 +85,14 @@ class Execution:
     def polls(self) -> bool:
         """Whether it waits for more than time."""
         waits = self.wait is not None and self.wait.ready is not never
-        return waits or self.phase is Phase.SETTLING
+        return waits or self.phase in (Phase.SETTLING, Phase.TAKING)
 
     def due(self) -> float | None:
         """When it is worth a look without anything coming in (s)."""
         if self.phase is Phase.NEW:
             return -math.inf
         times = [self.limit, self.wait.due if self.wait else None]
-        if self.phase is Phase.COMPUTED:
+        if self.phase in (Phase.COMPUTED, Phase.TAKING):
             times.append(self.ready_at)
         return min((t for t in times if t is not None), default=None)
 
@@ -140,7 +151,9 @@ class Execution:
         try:
             if coroutine is not None:
                 coroutine.close()
-        except (Exception, SystemExit, Cancelled) as fault:
+        except BaseException as fault:
+            if from_outside(fault):
+                raise
             return describe(fault)
         return ""
 

@@ -6,13 +6,13 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from services.action import Result, Status
-from services.callables import check_arguments, describe
+from services.action import Status
+from services.callables import check_arguments, describe, from_outside
 from services.comm.callee import Inline
 from services.comm.directory import ServiceEntry, resolve
 from services.comm.messages import Call, Executed, Outcome
-from services.comm.plain import NotPlainError, plain
-from services.context import RunContext
+from services.context import RunContext, checked_result
+from services.execution import Hung
 from services.outlets import Outlets
 from services.runs import Begin, Judged, Raised, Report
 
@@ -44,16 +44,17 @@ def inline_service(service: ServiceEntry, raised: EventSink, judged: VerdictSink
         before = time.process_time()
         try:
             result = function(context, **call.arguments)
-        except Exception as fault:
-            return Outcome(call.id, Status.ERROR, {}, "exception", describe(fault))
-        if not isinstance(result, Result):
-            text = f"returned a {type(result).__name__}; return success(), failure() or error()"
-            return Outcome(call.id, Status.ERROR, {}, "bad_result", text)
+        except BaseException as fault:  # a service may raise SystemExit or its like: that must not end the node
+            if from_outside(fault):
+                raise
+            return Outcome(
+                call.id, Status.ERROR, {}, "hung" if isinstance(fault, Hung) else "exception", describe(fault)
+            )
         try:
-            values = plain(result.values, "values")
-        except NotPlainError as fault:
+            result = checked_result(call.id, result, "values")
+        except ValueError as fault:
             return Outcome(call.id, Status.ERROR, {}, "bad_result", f"what it returned cannot be sent: {fault}")
         cpu = time.process_time() - before
-        return Outcome(call.id, result.status, values, result.cause, result.text, cpu_seconds=cpu)
+        return Outcome(call.id, result.status, result.values, result.cause, result.text, cpu_seconds=cpu)
 
     return answer

@@ -5,14 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from services.callables import describe
+from services.comm.cell import CellError
 from services.comm.channels import set_point_body
 from services.comm.directory import Directory
 from services.comm.messages import Accept, Answer, Call, Event, Feedback, Hello, Message, Outcome, Pong, Refuse, Welcome
 from services.comm.party import Envelope
 from services.drivers import make_driver
+from services.execution import Hung
 from services.lockstep_ports import LockstepPorts
 from services.node import GENERAL, Node
 from services.place import InlinePlace, Place
+from services.watchdog import Watchdog
 
 Substitutes = Mapping[str, Callable[..., Any]]
 _ANSWERS = (Welcome, Refuse, Accept, Feedback, Outcome, Event, Answer, Pong)
@@ -30,6 +34,7 @@ class LockstepNode:
         self.name = name
         self._directory = directory
         self._substitutes = substitutes
+        self._watchdog = Watchdog(name)
         self._now = 0.0
         self._out: list[Envelope] = []
         self._ports: dict[str, LockstepPorts] = {}
@@ -68,7 +73,10 @@ class LockstepNode:
     # --- party -------------------------------------------------------------------------------------------------------
 
     def receive(self, now: float, envelope: Envelope) -> None:
-        """Take an envelope that is due."""
+        """Take an envelope that is due. Raises CellError when code that is called hangs."""
+        self._guarded(lambda: self._receive(now, envelope))
+
+    def _receive(self, now: float, envelope: Envelope) -> None:
         self._now = now
         if envelope.channel == "call":
             self._heard = True
@@ -77,7 +85,19 @@ class LockstepNode:
             self._ports[envelope.target].receive(envelope)
 
     def advance(self, now: float) -> None:
-        """Do all that is due."""
+        """Do all that is due. Raises CellError when code that is called hangs."""
+        self._guarded(lambda: self._advance(now))
+
+    def _guarded(self, step: Callable[[], None]) -> None:
+        self._watchdog.begin()
+        try:
+            step()
+        except Hung as fault:  # not in an action, or its run would have ended with it
+            raise CellError(f"node {self.name}: {describe(fault)}") from fault
+        finally:
+            self._watchdog.end()
+
+    def _advance(self, now: float) -> None:
         self._now = now
         news = self._advance_node(now)
         for device, ports in self._ports.items():
@@ -119,6 +139,7 @@ class LockstepNode:
 
     def close(self) -> None:
         """Let the devices go."""
+        self._watchdog.close()
         self.node.close(self._now)
 
     # --- messages ----------------------------------------------------------------------------------------------------

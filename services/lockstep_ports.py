@@ -10,8 +10,10 @@ from services.comm.canbus import Frame
 from services.comm.channels import can_body, images_wanted, read_can, read_image, read_set_point
 from services.comm.directory import DeviceEntry, Directory
 from services.comm.image import ImageSource
+from services.comm.messages import Event
 from services.comm.party import Envelope
 from services.comm.plain import plain
+from services.context import checked
 from services.setpoints import SetpointReceiver
 
 
@@ -91,7 +93,9 @@ class LockstepPorts:
 
     def raise_event(self, name: str, **data: Any) -> None:
         """Raise an external event."""
-        self._raised.append((name, plain(data, "data")))
+        raised = plain(name, "name"), plain(data, "data")
+        checked(Event(raised[0], self._device.name, 1, raised[1]))
+        self._raised.append(raised)
 
     def file(self, path: str) -> bytes:
         """A file named in services.toml, relative to it."""

@@ -12,7 +12,7 @@ from services.action import Result, error, failure, success
 from services.comm.directory import MEMORY_CALLS
 
 VALUE_BYTES = 1 << 20
-"""Largest value (bytes as msgpack)."""
+"""Largest value (bytes as msgpack). The event that tells it is allowed twice as much."""
 VARIABLES = 10_000
 """Most variables."""
 TOTAL_BYTES = 64 << 20

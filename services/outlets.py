@@ -6,8 +6,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from services.comm.codec import LIMITS
+from services.comm.messages import SetPoint
 from services.runs import Sent
 
+MOST = (LIMITS[SetPoint.KIND] - 64) // 9
+"""Numbers of a set point: 9 bytes each in its message, and room for the rest of it."""
 SLACK = 1e-6  # s: binary fractions of a period must not cost a whole tick
 
 
@@ -34,6 +38,8 @@ class Outlets:
         if outlet is None:
             raise ValueError(f"no stream is named {stream!r}; services.toml has: {', '.join(self._outlets) or 'none'}")
         numbers = tuple(float(v) for v in values)
+        if len(numbers) > MOST:
+            raise ValueError(f"set point of {stream!r}: expected at most {MOST} numbers, found {len(numbers):,}")
         if not all(map(math.isfinite, numbers)):
             raise ValueError(f"set point of {stream!r} is not finite: {numbers}")
         if stream not in self._open:

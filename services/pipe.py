@@ -89,6 +89,7 @@ class Pipe:
     def read(self) -> list[list[Any]]:
         """All lists that have come. Raises ValueError for what is not msgpack: user code has written into the pipe."""
         self._end_copy()
+        items: list[list[Any]] = []
         with contextlib.suppress(BlockingIOError):
             while not self._ended:
                 try:
@@ -101,7 +102,9 @@ class Pipe:
                     self.closed = self._ended = True
                     break
                 self._feed(data)
-        return [item for item in self._unpacker if isinstance(item, list)]
+                # Taken out before more is read: several large records that came together are more than its buffer holds.
+                items += [item for item in self._unpacker if isinstance(item, list)]
+        return items
 
     def _feed(self, data: bytes) -> None:
         try:

@@ -3,14 +3,29 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
+from services.action import Status
+from services.callables import describe
 from services.comm.directory import ActionEntry
+from services.comm.messages import Executed
+from services.comm.plain import plain
 from services.device import PICTURE, Driver, picture_of, stop_at_once
-from services.remote import CLEAR_EMERGENCY, EMERGENCY_STOP, CyclicDriver, DeviceCommand, DirectDevice, RemoteDriver
+from services.remote import (
+    BARRED,
+    CLEAR_EMERGENCY,
+    EMERGENCY_STOP,
+    CyclicDriver,
+    DeviceCommand,
+    DirectDevice,
+    RemoteDriver,
+)
 from services.runner import DeviceControl, Runner
-from services.runs import Hold, Order, Report, Stop, Told
+from services.runs import Begin, Ended, Hold, Order, Report, Stop, Told
+
+_log = logging.getLogger(__name__)
 
 SLACK = 1e-6  # s: binary fractions of a period must not cost a whole tick
 
@@ -63,6 +78,9 @@ class InlinePlace:
         self._driver = driver
         self._cyclic = CyclicDriver(driver) if driver is not None and driver.period else None
         self._remote = RemoteDriver(self._post, clock)
+        self._outside = remote if isinstance(remote, RemoteDriver) else None
+        self.failed = ""
+        """Why the driver works no more: what it raised, and where. Its runs have ended, and no other begins."""
         if self._cyclic is not None:
             self._remote.expect(self._cyclic.state)
         self._commands: list[DeviceCommand] = []
@@ -94,6 +112,10 @@ class InlinePlace:
 
     def take(self, now: float, order: Order) -> None:
         """Take an order about a run."""
+        if self.failed and isinstance(order, Begin):
+            text = f"its device does not work: {self.failed}"
+            self._told.append(Ended(order.id, Status.ERROR, {}, "not_ready", text, Executed.NO))
+            return
         held = self._runner.held and bool(self._runner.runs)
         self._runner.take(now, order)
         if held and not self._runner.runs:
@@ -101,7 +123,33 @@ class InlinePlace:
 
     def command(self, now: float, id: str, verb: str) -> None:  # noqa: A002
         """Carry out an operator's command at once."""
-        self._told.append(Told(id, *self._carry_out(now, verb)))
+        if not self.failed:
+            try:
+                self._told.append(Told(id, *self._carry_out(now, verb)))
+                return
+            except Exception as fault:
+                self._fail(now, fault)
+        self._told.append(Told(id, "not ready", {"text": self.failed}))
+
+    def bar(self, now: float, cause: str) -> None:
+        """Stop the device and its runs without an order: nobody may be able to give one."""
+        for run in self._runner.runs:
+            self._runner.take(now, Stop(run, cause, BARRED[cause]))
+        try:
+            self._stop_driver(now, cause)
+        except Exception as fault:
+            self._fail(now, fault)
+
+    def _fail(self, now: float, fault: Exception) -> None:
+        """The driver has raised what it must not: its runs end, and it is stopped as far as it still can be."""
+        self.failed = f"its driver failed: {describe(fault)}"
+        _log.error("the driver of a device failed", exc_info=fault)
+        driver, self._driver, self._cyclic = self._driver, None, None
+        self._told += self._runner.reports()
+        self._told += self._runner.give_up_all(now, "device_died", self.failed)
+        if driver is not None:
+            with contextlib.suppress(Exception):
+                stop_at_once(driver, now)
 
     def _carry_out(self, now: float, verb: str) -> tuple[str, Mapping[str, Any]]:
         driver = self._driver
@@ -126,8 +174,11 @@ class InlinePlace:
             return "cleared", {}
         if verb == PICTURE:
             return PICTURE, picture_of(driver)
-        state = dict(driver.state()) if driver else {}
-        return "up", {"runs": list(self._runner.runs), "fenced": self._runner.fenced, "state": state}
+        data = {"runs": list(self._runner.runs), "fenced": self._runner.fenced}
+        data["state"] = plain(driver.state(), "state") if driver else {}
+        if self._cyclic:
+            data["refused"] = self._cyclic.refused
+        return "up", data
 
     def _stop_driver(self, now: float, verb: str) -> None:
         if self._cyclic is not None and verb == EMERGENCY_STOP:
@@ -149,11 +200,22 @@ class InlinePlace:
 
     @property
     def idle(self) -> bool:
-        """Whether there is neither a run nor a cyclic driver, nor anything to tell."""
+        """Whether there is neither a run nor a cyclic driver, nor anything to report."""
         return self._cyclic is None and not self._told and self._runner.idle
 
     def advance(self, now: float) -> None:
         """Runs first, then as many cycles of the driver as are due."""
+        if self.failed:
+            return
+        try:
+            self._advance(now)
+        except Exception as fault:  # code of actions is guarded where it is called: this was the driver's
+            self._fail(now, fault)
+
+    def _advance(self, now: float) -> None:
+        if self._outside is not None and (barred := self._outside.barred):
+            for run in self._runner.runs:
+                self._runner.take(now, Stop(run, barred, BARRED[barred]))
         held = self._runner.held and bool(self._runner.runs)
         self._runner.advance(now)
         if held and not self._runner.runs:
@@ -169,9 +231,12 @@ class InlinePlace:
             self._remote.expect(self._cyclic.state)
             due += self._driver.period
         self._next_step = due
+        self._runner.commands_taken(now)
 
     def due(self) -> float | None:
         """When `advance` has something to do at the latest (s)."""
+        if self.failed:
+            return None
         times = (self._runner.due(), self._next_step)
         return min((t for t in times if t is not None), default=None)
 
@@ -186,5 +251,8 @@ class InlinePlace:
     def close(self, now: float) -> None:
         """Stop routine, then let the device go."""
         if self._driver is not None:
-            self._driver.stop(now)
-            self._driver.close()
+            try:
+                self._driver.stop(now)
+                self._driver.close()
+            except Exception:
+                _log.exception("a driver failed while it was let go")

@@ -9,8 +9,10 @@ from services.comm.canbus import CanBus
 from services.comm.credentials import credentials
 from services.comm.directory import DeviceEntry, Directory
 from services.comm.image import ImageSource
+from services.comm.messages import Event
 from services.comm.plain import plain
 from services.comm.stream import Incoming, StreamReceiver
+from services.context import checked
 from services.setpoints import SetpointReceiver
 
 CAN_KEYS = ("interface", "channel", "bitrate")
@@ -81,7 +83,9 @@ class ProcessPorts:
 
     def raise_event(self, name: str, **data: Any) -> None:
         """Raise an external event."""
-        self._raised.append((name, plain(data, "data")))
+        raised = plain(name, "name"), plain(data, "data")
+        checked(Event(raised[0], self._device.name, 1, raised[1]))
+        self._raised.append(raised)
 
     def file(self, path: str) -> bytes:
         """A file named in services.toml, relative to it."""

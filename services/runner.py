@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, Protocol
 
 from services.action import Cancelled, Result, Status
-from services.callables import check_arguments, describe
+from services.callables import check_arguments, describe, from_outside
 from services.comm.directory import ActionEntry, resolve
 from services.comm.messages import Executed
 from services.comm.plain import plain
-from services.context import RunContext
-from services.execution import Execution, Phase, Returned
+from services.context import RunContext, checked_result
+from services.execution import Execution, Hung, Phase, Returned
 from services.outlets import Outlets
+from services.remote import Refusing
 from services.runs import Answered, Begin, Ended, Hold, Order, Report, Stop
+
+_log = logging.getLogger(__name__)
 
 GRACE = 0.5
 """Seconds that a cancelled action has to clean up and its device to stand still before the stop routine is called."""
 STOP_LIMIT = 2.0
 """Seconds after the stop routine when the run ends although its device is not known to stand still; the device stays fenced."""
+TAKEN_WITHIN = 1.0
+"""Seconds that a driver has to take the commands of a run that has returned: until then nobody knows whether it refuses one."""
 _AFTER = (Phase.STOPPING, Phase.SETTLING)
-_FAULTS = (Exception, SystemExit, Cancelled)
 
 
 class DeviceControl(Protocol):
@@ -59,6 +65,7 @@ class Runner:
         self._actions = actions
         self._clock = clock
         self._device = device
+        self._refusing: Refusing | None = device if isinstance(device, Refusing) else None
         self._outlets = Outlets(streams or {})
         self._callables: dict[str, Callable[..., Any]] = dict(substitutes or {})
         self._virtual = virtual
@@ -144,6 +151,24 @@ class Runner:
         if not held:
             self._reports += self._outlets.advance(now)
 
+    def commands_taken(self, now: float) -> None:
+        """The driver has just been stepped: end the runs that only waited for it to take their last commands."""
+        for run in [run for run in self._runs.values() if run.phase is Phase.TAKING]:
+            self._await_taking(now, run)
+
+    def give_up_all(self, now: float, cause: str, text: str) -> list[Report]:
+        """The device is no more: how all runs end, without its stop routine."""
+        ends: list[Report] = []
+        for identity, run in self._runs.items():
+            if fault := run.close():
+                _log.warning("run %s did not let itself be closed: %s", identity, fault)
+            self._outlets.close(identity)
+            executed = Executed.NO if run.phase is Phase.NEW else Executed.UNKNOWN
+            took = 0.0 if run.phase is Phase.NEW else now - run.started
+            ends.append(Ended(identity, Status.ERROR, {}, cause, text, executed, took, run.cpu))
+        self._runs.clear()
+        return ends
+
     # --- begin -------------------------------------------------------------------------------------------------------
 
     def _begin(self, begin: Begin) -> None:
@@ -187,6 +212,7 @@ class Runner:
         handle = self._device.handle if self._device else None
         run.context = RunContext(begin, handle, self._clock, self._outlets, self._report)
         run.phase, run.started = Phase.RUNNING, now
+        run.sent_before = self._refusing.sent if self._refusing is not None else 0
         run.limit = None if begin.deadline is None else now + begin.deadline
         self._in_action(now, run, lambda: run.call(function, arguments))
 
@@ -203,8 +229,10 @@ class Runner:
             self._stop(now, run, "deadline", f"not over after {run.begin.deadline:g} s")
         elif run.phase is Phase.RUNNING:
             self._in_action(now, run, lambda: run.look(now))
+        elif run.phase is Phase.TAKING:
+            self._await_taking(now, run)
         elif run.result is not None and now >= run.ready_at - 1e-9:
-            self._end(now, run, run.result)
+            self._finish(now, run, run.result)
 
     def _in_action(self, now: float, run: Execution, step: Callable[[], None]) -> None:
         """Let the action's own code go on, and take what comes of it."""
@@ -212,11 +240,15 @@ class Runner:
             step()
         except Returned as returned:
             self._returned(now, run, returned.value)
-        except _FAULTS as fault:
+        except BaseException as fault:  # an action may raise SystemExit or its like: that ends its run, not the others'
+            if from_outside(fault):
+                raise
             run.close()
             if run.phase is not Phase.STOPPING:
-                cause = "out_of_memory" if isinstance(fault, MemoryError) else "exception"
-                self._give_up(now, run, cause, describe(fault))
+                cause = "hung" if isinstance(fault, Hung) else "exception"
+                if isinstance(fault, MemoryError):
+                    cause = "out_of_memory"
+                self._give_up(now, run, cause, self._with_refusal(run, describe(fault)))
             elif not isinstance(fault, Cancelled):
                 run.note(f"while it cleaned up: {describe(fault)}")
         if run.phase is Phase.STOPPING and run.over:
@@ -230,16 +262,40 @@ class Runner:
             self._give_up(now, run, "bad_result", f"returned a {name}; return success(), failure() or error()")
             return
         try:
-            values = plain(returned.values, "result")
-            said = (str(returned.cause), str(returned.text), bool(returned.deferred))
-            result = Result(Status(returned.status), values, *said)
-        except (TypeError, ValueError) as fault:
-            self._give_up(now, run, "bad_result", str(fault))
+            result = checked_result(run.begin.id, returned)
+        except ValueError as fault:
+            self._give_up(now, run, "bad_result", self._with_refusal(run, str(fault)))
             return
         if self._virtual and run.entry.compute_time > 0:
             run.phase, run.result, run.ready_at = Phase.COMPUTED, result, now + run.entry.compute_time
         else:
-            self._end(now, run, result)
+            self._finish(now, run, result)
+
+    def _finish(self, now: float, run: Execution, result: Result) -> None:
+        """End the run as its action said, as soon as it is known that the driver has refused none of its commands."""
+        if result.status is Status.ERROR:
+            text = self._with_refusal(run, result.text)
+            self._end(now, run, replace(result, text=text))
+            return
+        self._outlets.close(run.begin.id)
+        run.phase, run.result, run.ready_at = Phase.TAKING, result, now + TAKEN_WITHIN
+        self._await_taking(now, run)
+
+    def _await_taking(self, now: float, run: Execution) -> None:
+        refusal = self._refusing.refusal(run.sent_before) if self._refusing is not None else ""
+        if refusal:
+            text = f"the driver refused a command, and the action did not look at that: {refusal}"
+            self._give_up(now, run, "command_refused", text)
+        elif refusal is None and now >= run.ready_at - 1e-9:
+            text = f"the action returned, but the driver did not take its last command within {TAKEN_WITHIN:g} s"
+            self._give_up(now, run, "command_not_taken", text)
+        elif refusal == "" and run.result is not None:
+            self._end(now, run, run.result)
+
+    def _with_refusal(self, run: Execution, text: str) -> str:
+        """The text of an ERROR, and what the driver refused without the action's looking: that is often the reason."""
+        refusal = self._refusing.refusal(run.sent_before) if self._refusing is not None else ""
+        return f"{text}; the driver refused a command: {refusal}".lstrip("; ") if refusal else text
 
     # --- end ---------------------------------------------------------------------------------------------------------
 
@@ -252,6 +308,7 @@ class Runner:
         if run.phase is Phase.NEW:
             self._drop(run, cause, text)
         elif run.phase not in _AFTER:
+            text = self._with_refusal(run, text) if cause == "deadline" else text
             run.cause, run.text, run.result, run.limit = cause, text, None, now + GRACE
             # A held device stands without having been stopped: released, it would go on without its run.
             run.abandoned = self.held

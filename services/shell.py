@@ -22,6 +22,7 @@ from services.comm.notice import Notice
 from services.comm.parentage import GOOD_ORDER, outlive, wanted_with_parent
 from services.comm.security import require_key
 from services.comm.server import Server
+from services.emergency_stops import BEAT, BEAT_EVERY
 from services.node import GENERAL, Node, stream_service
 from services.place import Place
 from services.remote import IN_EMERGENCY
@@ -61,6 +62,7 @@ class NodeShell:
         self._tasks: set[asyncio.Task[None]] = set()
         self._timer: asyncio.TimerHandle | None = None
         self._soon: asyncio.Handle | None = None
+        self._beating: asyncio.TimerHandle | None = None
         self._change = asyncio.Event()
         self._serving = False
 
@@ -91,6 +93,7 @@ class NodeShell:
         try:
             for place in self._workers.values():
                 place.start()
+            self._beat()
             async with asyncio.timeout(START_LIMIT):
                 await self._until_ready()
             with listening(self._directory, self._name):
@@ -105,6 +108,14 @@ class NodeShell:
             raise
         self._step()
 
+    def _beat(self) -> None:
+        """Let the processes of devices know that this loop runs: they stop their devices when it does not."""
+        for place in self._workers.values():
+            for child in place.children():
+                if not child.pipe.unsent:  # it does not read: more of the same would only pile up
+                    child.post([BEAT])
+        self._beating = self._loop.call_later(BEAT_EVERY, self._beat)
+
     async def _until_ready(self) -> None:
         while not all(place.ready for place in self._workers.values()):
             failed = next((place.failed for place in self._workers.values() if place.failed), "")
@@ -115,6 +126,8 @@ class NodeShell:
 
     async def close(self) -> None:
         """Stop routines of all devices, then good-bye to all."""
+        if self._beating is not None:
+            self._beating.cancel()
         self._cancel_timers()
         self.node.close(self._loop.time())
         for task in self._tasks:

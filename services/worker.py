@@ -6,6 +6,7 @@ says over the pipe which it is to be. A process that makes its device's driver a
 
 from __future__ import annotations
 
+import logging
 import os
 import resource
 import select
@@ -20,10 +21,12 @@ from pathlib import Path
 from typing import Any
 
 from services.comm.directory import Directory, DirectoryError, parse
+from services.comm.latch import latch_of
 from services.comm.parentage import STOP_ROUTINE, outlive
 from services.device import Driver
-from services.device_process import DeviceLoop, take_priority
+from services.device_process import DeviceError, DeviceLoop, take_priority
 from services.drivers import make_driver
+from services.emergency_stops import BEAT, Guard
 from services.pipe import NewestLink, Pipe, keep_from_copies
 from services.place import InlinePlace
 from services.ports import ProcessPorts
@@ -76,8 +79,11 @@ class Worker:
         link: NewestLink | None = None,
         driver: Driver | None = None,
         ports: ProcessPorts | None = None,
+        guard: Guard | None = None,
     ) -> None:
         self._node = node
+        self._guard = guard
+        self._barred = ""
         self._link = link
         self._ports = ports
         self._remote = RemoteDriver(self._post_command, time.monotonic) if link else None
@@ -107,7 +113,7 @@ class Worker:
                 self._read_link(self._link)
 
     def run(self) -> None:
-        """Serve until the node is gone."""
+        """Serve until the node is gone. Exits when the driver fails."""
         while not self._node.closed:
             self._selector.select(self._pause())
             if self._link is not None:
@@ -118,16 +124,32 @@ class Worker:
             if self._ports is not None:
                 self._ports.poll()
             now = time.monotonic()
+            if self._guard is not None and now >= self._guard.due:
+                self._watch(now, self._guard)
             self._place.advance(now)
+            if self._place.failed:
+                # Before the ends of its runs: no other run is to come here.
+                self._node.post([FAILED, self._place.failed])
+                self._report(now)
+                sys.exit(1)
             self._report(now)
         self._place.close(time.monotonic())
         self._outlets.close()
+
+    def _watch(self, now: float, guard: Guard) -> None:
+        """Stop device and runs without an order where nobody may be able to give one."""
+        cause, before = guard.look(now), self._barred
+        self._barred = cause
+        if cause and cause != before:
+            self._place.bar(now, cause)
 
     def _pause(self) -> float | None:
         """How long nothing can be due (s), None for as long as nothing comes in."""
         if self._node.unsent:
             return POLL
         due = self._place.due()
+        if self._guard is not None:
+            due = self._guard.due if due is None else min(due, self._guard.due)
         pause = None if due is None else max(0.0, due - time.monotonic())
         busy = self._ports is not None and self._ports.busy
         if self._place.polling or self._connecting or busy:
@@ -135,6 +157,10 @@ class Worker:
         return pause
 
     def _take(self, now: float, items: list[Any]) -> None:
+        if self._guard is not None:
+            self._guard.heard(now, items[0] == BEAT)
+        if items[0] == BEAT:
+            return
         if items[0] == PING:
             self._node.post([PONG, items[1]])
         elif items[0] == COMMAND:
@@ -195,20 +221,28 @@ def serve(node: Pipe, descriptors: socket.socket | None, link: NewestLink | None
         if link is None and setup.device:
             ports = ProcessPorts(directory, directory.devices[setup.device], time.monotonic, setup.tickets)
             driver = make_driver(directory, directory.devices[setup.device], ports)
+            guard = Guard(setup.device, latch_of(directory.source, setup.node))
             if driver.period and descriptors is not None:
                 node.post([READY, {"period": driver.period, "streams": ports.stream_ports(), "fifo": take_priority()}])
-                DeviceLoop(driver, ports, node, descriptors).run()
+                DeviceLoop(driver, ports, node, descriptors, guard).run()
                 return
-            worker = Worker(setup, directory, node, driver=driver, ports=ports)
+            worker = Worker(setup, directory, node, driver=driver, ports=ports, guard=guard)
             streams = ports.stream_ports()
         else:
             worker, streams = Worker(setup, directory, node, link=link), {}
-    except (DirectoryError, OSError, ValueError) as fault:
+        worker.await_device()
+        node.post([READY, {"period": None, "streams": streams, "fifo": False}])
+        worker.run()
+    except (DirectoryError, DeviceError, OSError, ValueError) as fault:
         node.post([FAILED, str(fault)])
-        return
-    worker.await_device()
-    node.post([READY, {"period": None, "streams": streams, "fifo": False}])
-    worker.run()
+        sys.exit(1)
+
+
+def log_to_stderr() -> None:
+    """Write what the modules of services log to the process's standard error, which is its node's log."""
+    logging.basicConfig(
+        format="%(asctime)s %(levelname)s %(name)s, process %(process)d: %(message)s", level=logging.INFO
+    )
 
 
 def main(arguments: list[str]) -> None:
@@ -217,6 +251,7 @@ def main(arguments: list[str]) -> None:
         # The node decides when its children end. A handler, unlike SIG_IGN, is not passed on to programs that user code starts.
         signal.signal(number, lambda *_: None)
     os.register_at_fork(after_in_child=_take_signals)
+    log_to_stderr()
     pipe, descriptors, link = (socket.socket(fileno=int(a)) if int(a) >= 0 else None for a in arguments)
     assert pipe is not None
     node, driver_link = Pipe(pipe), NewestLink(link) if link is not None else None

@@ -174,7 +174,7 @@ class WorkerPlace:
     @property
     def ready(self) -> bool:
         """Whether a run would be taken at once: its processes are up, and none of them is known to end."""
-        return self._stage is Stage.READY and self._takes_orders()
+        return self._stage is Stage.READY and not self.failed and self._takes_orders()
 
     def _takes_orders(self) -> bool:
         return self._worker is not None and not self._worker.closed and not (self._owner and self._owner.closed)
@@ -251,7 +251,7 @@ class WorkerPlace:
         if items[0] == READY:
             self._take_ready(child, items[1])
         elif items[0] == FAILED:
-            self.failed = str(items[1])
+            self.failed = str(items[1])  # it is about to end: what is ordered now waits for its successor
         elif items[0] == PONG:
             for run in self._runs.values():
                 run.pong = run.pong or run.stop is not None
@@ -315,7 +315,7 @@ class WorkerPlace:
 
     def _all_ended(self, child: Child) -> None:
         """The process with the driver, or the only one: nothing of this place runs any more."""
-        why, worker, was_ready = child.describe(), self._worker, self._stage is not Stage.DRIVER_STARTS
+        why, worker, was_ready = self.failed or child.describe(), self._worker, self._stage is not Stage.DRIVER_STARTS
         driver = child is self._owner and worker is not child and was_ready
         self._owner = self._worker = None
         self.streams = {}
@@ -325,7 +325,8 @@ class WorkerPlace:
             if worker is not None:
                 worker.kill()
         else:
-            self._lose_runs(*_cause_of(child))
+            cause, text = _cause_of(child)
+            self._lose_runs(cause, f"the process of its action died: {why}" if self.failed else text)
         self._answer_commands()
         self._tell_lost(f"driver: {why}" if driver else "")
         if self._move(Happening.ALL_ENDED):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
@@ -82,25 +82,31 @@ def _print(answers: dict[str, Any]) -> None:
     for node, answer in answers.items():
         troubles = answer.get("not_ready", {})
         state = "[green]up[/]" if answer["up"] else "[yellow]not ready[/]" if troubles else "[red]away[/]"
-        devices = [*answer.get("status", {}).get("devices", {}), *troubles]
-        shown = _devices(devices, answer.get("stopped", []), troubles)
+        shown = _devices(answer.get("status", {}).get("devices", {}), answer.get("stopped", []), troubles)
         ends = [_ends(answer.get("certificate_ends", ""))] if certified else []
         offers = ", ".join(answer.get("offers", [answer.get("why", "")]))
         table.add_row(node, answer["address"], state, *ends, offers, shown)
     Console().print(table)
 
 
-def _devices(devices: Iterable[str], stopped: Sequence[str], troubles: Mapping[str, str]) -> str:
-    """Names of devices; with each that takes no call what it does instead, or what to do about it."""
-
+def _devices(devices: Mapping[str, Any], stopped: Sequence[str], troubles: Mapping[str, str]) -> str:
+    """Names of devices, each with what is wrong with it: an emergency stop, why it takes no call, refusals, late cycles."""
     from rich.markup import escape
 
-    def shown(device: str) -> str:
+    shown = []
+    for device in dict.fromkeys((*devices, *troubles, *stopped)):
+        said, told = [device], devices.get(device, {})
         if device in stopped:
-            return f"{device} [red]stopped (petrobot estop --clear)[/]"
-        return f"{device} [yellow]{escape(troubles[device])}[/]" if device in troubles else device
-
-    return ", ".join(shown(device) for device in dict.fromkeys((*devices, *stopped)))
+            said.append("[red]stopped (petrobot estop --clear)[/]")
+        elif device in troubles:
+            said.append(f"[yellow]{escape(troubles[device])}[/]")  # a driver's text, perhaps
+        if told.get("refused"):
+            said.append(f"[yellow]{told['refused']} refused[/]")
+        if told.get("overruns"):
+            late = told.get("late_ms", 0.0)
+            said.append(f"[yellow]{told['overruns']} cycles missed, at most {late:.0f} ms late[/]")
+        shown.append(" ".join(said))
+    return ", ".join(shown)
 
 
 def _ends(ends: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from operator import attrgetter
 from typing import Any, NamedTuple, get_args
 
@@ -16,7 +16,19 @@ from services.comm.canbus import Frame
 from services.comm.frequent import COUNT_END, EXECUTED, NAME_LENGTH, READERS, WRITERS
 from services.comm.messages import Executed, Message, Tick
 from services.comm.party import Envelope, Posted
-from services.comm.plain import NotPlainError, inspect, pack_array, unpack_array
+from services.comm.plain import LARGEST, MAX_CONTAINERS, NotPlainError, inspect, pack_array, unpack_array
+
+__all__ = [
+    "LIMITS",
+    "MAX_CONTAINERS",
+    "UNCOUNTED",
+    "ProtocolError",
+    "decode",
+    "decode_by_table",
+    "decode_kind",
+    "encode",
+]
+__all__ += ["encode_all", "kind_of", "no_extension", "unpack"]
 
 KIB, MIB = 1024, 1024 * 1024
 
@@ -24,20 +36,20 @@ LIMITS: Mapping[int, int] = {
     m.Hello.KIND: 4 * KIB,
     m.Welcome.KIND: MIB,
     m.Refuse.KIND: 4 * KIB,
-    m.Call.KIND: 16 * MIB,
+    m.Call.KIND: LARGEST,
     m.Accept.KIND: KIB,
     m.Feedback.KIND: 64 * KIB,
-    m.Outcome.KIND: 16 * MIB,
+    m.Outcome.KIND: LARGEST,
     m.ResultAck.KIND: 64 * KIB,
     m.Cancel.KIND: 4 * KIB,
-    m.Event.KIND: MIB,
+    m.Event.KIND: 2 * MIB,
     m.EventAck.KIND: KIB,
     m.Subscribe.KIND: 64 * KIB,
     m.Command.KIND: 64 * KIB,
     m.Answer.KIND: MIB,
     m.Ping.KIND: 32,
     m.Pong.KIND: 32,
-    m.Tick.KIND: 16 * MIB,
+    m.Tick.KIND: LARGEST,
     m.Bye.KIND: 4 * KIB,
     m.Challenge.KIND: 128,
     m.Proof.KIND: 128,
@@ -47,8 +59,6 @@ LIMITS: Mapping[int, int] = {
 }
 """Largest body of each kind (bytes), the MAC not counted."""
 
-MAX_CONTAINERS = 100_000
-"""Most arrays and maps in one message: one byte each on the wire, some 70 in memory."""
 UNCOUNTED = 64 * KIB
 """Bodies up to so many bytes are read without counting their arrays and maps."""
 _SELDOM = frozenset((m.Call.KIND, m.Outcome.KIND))
@@ -73,9 +83,13 @@ class _FieldError(ValueError):
     """What is wrong with one field; `decode` adds which."""
 
 
+class _LongNameError(_FieldError):
+    """A name that is longer than any."""
+
+
 def _name(value: str) -> str:
     if len(value) > NAME_LENGTH:
-        raise _FieldError(f"longer than {NAME_LENGTH} characters")
+        raise _LongNameError(f"expected at most {NAME_LENGTH} characters, found {len(value):,}")
     return value
 
 
@@ -142,11 +156,19 @@ def _body_in(channel: str, body: Any) -> Any:
     return tuple(_body_in(channel, item) for item in body)
 
 
+_ALSO: Mapping[type, tuple[type, ...]] = {list: (tuple,), float: (int,)}
+
+
 class _Field(NamedTuple):
     """How a field of one annotation looks on the wire, and what is checked beyond its type."""
 
     types: tuple[type, ...]
     check: Callable[[Any], Any] | None
+
+    @property
+    def out(self) -> tuple[type, ...]:
+        """Types that it may have on its way out: packed they are those on its way in, or taken for them."""
+        return (*self.types, *_ALSO.get(self.types[0], ()))
 
 
 _FIELDS = {
@@ -163,12 +185,14 @@ _FIELDS = {
     "tuple[Any, ...]": _Field((tuple,), _posted_all),
 }
 _FREE_TEXT = frozenset(("text", "reason"))
+_SHORTER = {"cause": "put long words into the text"}
+"""What to do about a name that is too long, by field."""
 
 
 class _Spec:
     """One kind of message: how its fields are read and written."""
 
-    __slots__ = ("checks", "cls", "fields", "long_checks", "names", "read", "required", "types")
+    __slots__ = ("checks", "cls", "fields", "long_checks", "names", "out", "read", "required", "types")
 
     def __init__(self, cls: type[Message]) -> None:
         described = dataclasses.fields(cls)
@@ -182,6 +206,11 @@ class _Spec:
         self.checks = self._checks(short=True)
         self.long_checks = self._checks(short=False)
         self.read = _reader(self.names)
+        self.out = [
+            (index + 1, name, field, field.check is not _name or name not in _FREE_TEXT)
+            for index, (name, field) in enumerate(zip(self.names, self.fields, strict=True))
+        ]
+        """Place in the array, name, field, and whether more than its type is checked."""
 
     def _checks(self, short: bool) -> tuple[tuple[int, Callable[[Any], Any]], ...]:
         """Checks by position; a body shorter than the longest name needs none of its names measured."""
@@ -205,23 +234,76 @@ unpack = msgpack.unpackb
 
 
 def encode(message: Message) -> bytes:
-    """Body of a frame, without length and MAC. Raises ProtocolError if the message is no message or too large."""
+    """Body of a frame, without length and MAC: what `decode` takes, and nothing else.
+
+    Raises ProtocolError for a message that the other side would have to refuse, since a refusal costs the connection: too
+    large, a name too long, a number out of its range, data that is not plain. Data in calls and results must have been
+    through `plain`.
+    """
     kind = message.KIND
+    if kind == _TICK:
+        body: bytes = _packed(message, lambda: msgpack.packb([kind, *_tick_out(message)], default=_extension))
+        return _small_enough(message, body)
     writer = WRITERS.get(kind)
+    row: Sequence[Any] | None = writer(message) if writer is not None else None
+    if row is None:
+        row = _row(message)
+    body = _packed(message, lambda: _pack(row))
+    if len(body) > UNCOUNTED:
+        if len(body) <= LIMITS[kind] and _containers(row) > MAX_CONTAINERS:
+            text = f"a {type(message).__name__} of more than {MAX_CONTAINERS:,} arrays and maps"
+            raise ProtocolError("too_large", text)
+        return _small_enough(message, body)
+    return body if len(body) <= LIMITS[kind] else _small_enough(message, body)
+
+
+def _packed(message: Message, pack: Callable[[], bytes]) -> bytes:
     try:
-        if writer is not None:
-            body: bytes = _pack(writer(message))
-        elif kind == Tick.KIND:
-            body = msgpack.packb([kind, *_tick_out(message)], default=_extension)
-        else:
-            row = [kind, *_SPECS[kind].read(message)]
-            body = _pack(row[:-1] if kind in _SELDOM and not row[-1] else row)
+        return pack()
+    except UnicodeEncodeError as fault:
+        found = f"U+{ord(fault.object[fault.start]):04X} in {fault.object[:40]!r}"
+        raise ProtocolError("unencodable", f"expected text that UTF-8 can carry, found {found}") from None
     except (TypeError, ValueError, OverflowError) as fault:
         raise ProtocolError("unencodable", f"{type(message).__name__}: {fault}") from None
-    if len(body) > LIMITS[kind]:
-        text = f"a {type(message).__name__} of {len(body)} bytes is above its limit of {LIMITS[kind]}"
+
+
+def _small_enough(message: Message, body: bytes) -> bytes:
+    limit = LIMITS[message.KIND]
+    if len(body) > limit:
+        text = f"a {type(message).__name__} of {len(body):,} bytes is above its limit of {limit:,}"
         raise ProtocolError("too_large", text)
     return body
+
+
+def _row(message: Message) -> list[Any]:
+    """The array that is a message's body, each field checked as the other side will check it. Raises ProtocolError."""
+    kind = message.KIND
+    spec = _SPECS[kind]
+    row = [kind, *spec.read(message)]
+    for index, name, field, checks in spec.out:
+        value = row[index]
+        try:
+            if not isinstance(value, field.out) or (type(value) is bool and bool not in field.types):
+                raise _FieldError(f"expected a {field.types[0].__name__}, found a {type(value).__name__}")
+            if checks and field.check is not None:
+                field.check(value)
+        except (_FieldError, NotPlainError, OverflowError) as fault:
+            remedy = f": {_SHORTER[name]}" if name in _SHORTER else ""
+            code = "too_large" if isinstance(fault, _LongNameError) else "unencodable"
+            raise ProtocolError(code, f"{name}: {fault}{remedy}") from None
+    return row[:-1] if kind in _SELDOM and not row[-1] else row
+
+
+def _containers(value: Any) -> int:
+    """How many arrays and maps the data is made of."""
+    count, waiting = 0, [value]
+    while waiting:
+        one = waiting.pop()
+        kind = type(one)
+        if kind is list or kind is tuple or kind is dict:
+            count += 1
+            waiting += one.values() if kind is dict else one
+    return count
 
 
 def encode_all(messages: Iterable[Message]) -> list[bytes]:
@@ -230,10 +312,10 @@ def encode_all(messages: Iterable[Message]) -> list[bytes]:
     for message in messages:
         kind = message.KIND
         writer = WRITERS.get(kind)
-        if writer is not None:
+        if writer is not None and (row := writer(message)) is not None:
             try:
-                body = _pack(writer(message))
-                if len(body) <= LIMITS[kind]:
+                body = _pack(row)
+                if len(body) <= UNCOUNTED:
                     bodies.append(body)
                     continue
             except (TypeError, ValueError, OverflowError):
@@ -318,7 +400,8 @@ def decode_by_table(body: bytes | memoryview, kind: int, size: int) -> Message:
         for index, check in spec.checks if size <= NAME_LENGTH else spec.long_checks:
             fields[index] = check(fields[index])
     except _FieldError as fault:
-        raise ProtocolError("malformed", f"kind {kind}: {fault}") from None
+        long = "a name is longer than it may be: " if isinstance(fault, _LongNameError) else ""
+        raise ProtocolError("malformed", f"kind {kind}: {long}{fault}") from None
     except NotPlainError as fault:
         raise ProtocolError("malformed", f"kind {kind}, {spec.names[index]}: {fault}") from None
     except IndexError:

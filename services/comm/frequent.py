@@ -64,15 +64,44 @@ READERS: Mapping[int, Reader] = {Call.KIND: _call, Outcome.KIND: _outcome}
 """By kind: reads the array of a body; `short` says that it is shorter than the longest name. Raises NotPlainError."""
 
 
-def _call_row(call: Any) -> tuple[Any, ...]:
-    row = (4, call.id, call.service, call.arguments, call.deadline, call.epoch, call.boot, call.parent, call.seed)
-    return (*row, True) if call.again else row  # seldom: after a broken link or a restart of the caller
+def _call_row(call: Any) -> tuple[Any, ...] | None:
+    id_, service, deadline, epoch, boot, parent, seed = (
+        call.id,
+        call.service,
+        call.deadline,
+        call.epoch,
+        call.boot,
+        call.parent,
+        call.seed,
+    )
+    if (
+        type(id_) is type(service) is type(boot) is type(parent) is str
+        and max(len(id_), len(service), len(boot), len(parent)) <= NAME_LENGTH
+        and (deadline is None or (type(deadline) is float and 0.0 <= deadline < inf))
+        and type(epoch) is type(seed) is int
+        and 0 <= epoch < COUNT_END
+        and 0 <= seed < COUNT_END
+    ):
+        row = (4, id_, service, call.arguments, deadline, epoch, boot, parent, seed)
+        return (*row, True) if call.again else row  # seldom: after a broken link or a restart of the caller
+    return None
 
 
-def _outcome_row(end: Any) -> tuple[Any, ...]:
-    row = (7, end.id, end.status, end.values, end.cause, end.text, end.executed, end.seconds, end.cpu_seconds)
-    return (*row, True) if end.deferred else row  # seldom; a peer that does not know the field never sees it otherwise
+def _outcome_row(end: Any) -> tuple[Any, ...] | None:
+    id_, status, cause, text, seconds, cpu = end.id, end.status, end.cause, end.text, end.seconds, end.cpu_seconds
+    if (
+        type(id_) is type(cause) is type(text) is str
+        and isinstance(status, str)
+        and max(len(id_), len(status), len(cause)) <= NAME_LENGTH
+        and end.executed in EXECUTED
+        and type(seconds) is type(cpu) is float
+        and 0.0 <= seconds < inf
+        and 0.0 <= cpu < inf
+    ):
+        row = (7, id_, status, end.values, cause, text, end.executed, seconds, cpu)
+        return (*row, True) if end.deferred else row  # seldom
+    return None
 
 
-WRITERS: Mapping[int, Callable[[Any], tuple[Any, ...]]] = {Call.KIND: _call_row, Outcome.KIND: _outcome_row}
-"""By kind: the message as the array that is its body."""
+WRITERS: Mapping[int, Callable[[Any], tuple[Any, ...] | None]] = {Call.KIND: _call_row, Outcome.KIND: _outcome_row}
+"""By kind: the message as the array that is its body; None for one that the table has to look at."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Mapping, Sequence
+from itertools import islice
 from types import NoneType
 from typing import Any
 
@@ -17,11 +18,32 @@ from numpy.typing import NDArray
 DEPTH = 32
 """How deep plain data may be nested."""
 
+LARGEST = 16 << 20
+"""Bytes of the largest message: nothing in it has more items or characters."""
+MAX_CONTAINERS = 100_000
+"""Most arrays and maps in one message: one byte each on the wire, some 70 in memory."""
+
 SCALARS = frozenset((NoneType, bool, int, float, str, bytes))
 _SIMPLE = SCALARS - {int}
 _INT_MIN, _INT_MAX = -(2**63), 2**64 - 1
+_INT64 = 2**63
+_KEY, _SHORT_INT = 60, 200
+"""Characters of a key, and bits of an integer, that stand in an error's text."""
+_MOST_FOREIGN = 1_000_000
+"""Items of a mapping that is not a dict: what yields them may never end."""
 
-_BASES: tuple[tuple[type, Callable[[Any], Any]], ...] = ((str, str), (bytes, bytes), (int, int), (float, float))
+# The base's own method takes the content of a subclass as it is, whatever the subclass has made of `str()` or `__iter__`.
+_BASES: tuple[tuple[type, Callable[[Any], Any]], ...] = (
+    (str, str.__str__),
+    (bytes, lambda value: b"".join((value,))),
+    (int, int.__int__),
+    (float, float.__float__),
+    (dict, lambda value: dict(dict.items(value))),
+    (list, lambda value: list.__getitem__(value, slice(None))),
+    (tuple, lambda value: tuple.__getitem__(value, slice(None))),
+)
+_NUMPY_KINDS = "biufUS"
+"""Kinds of numpy scalars that are numbers and texts: a date would become a number."""
 _DTYPES: Mapping[int, np.dtype[Any]] = {1: np.dtype("u1"), 2: np.dtype("<f8")}
 _CODES = {dtype: code for code, dtype in _DTYPES.items()}
 _MAX_DIMENSIONS = 4
@@ -35,57 +57,71 @@ def plain(value: Any, where: str = "value") -> Any:
     """The same data in plain types only: a copy, tuples as lists, numpy scalars as Python numbers.
 
     Done by the sender, so that a value is refused where it was made and both ends see the same types whether they live in
-    one process or in two. `where` names the data in the error. Raises NotPlainError.
+    one process or in two. `where` names the data in the error. Raises NotPlainError; whether a whole message of it is small
+    enough is for `codec.encode` to say.
     """
-    return _plain_dict(value, where, DEPTH) if type(value) is dict else _plain(value, where, DEPTH)
+    return _plain(value, where, DEPTH, [MAX_CONTAINERS])
 
 
-def _plain(value: Any, where: str, depth: int) -> Any:
+def _plain(value: Any, where: str, depth: int, left: list[int]) -> Any:
+    """`left` counts down the containers: of data that holds one of its parts many times over there may be no end."""
     kind = type(value)
     if kind in _SIMPLE:
         return value
     if kind is int:
         if not _INT_MIN <= value <= _INT_MAX:
-            raise NotPlainError(f"{where}: the integer {value} does not fit in 64 bits")
+            shown = value if value.bit_length() <= _SHORT_INT else f"of {value.bit_length():,} bits"
+            raise NotPlainError(f"{where}: the integer {shown} does not fit in 64 bits")
         return value
+    if kind is not list and kind is not tuple and kind is not dict:
+        return _plain_other(value, where, depth, left)
     if depth == 0:
         raise NotPlainError(f"{where}: nested deeper than {DEPTH} levels")
-    if kind is list or kind is tuple:
-        return _plain_list(value, where, depth)
-    if kind is dict or isinstance(value, Mapping):
-        return _plain_dict(value, where, depth)
-    return _plain_other(value, where, depth)
+    left[0] -= 1
+    if left[0] < 0 or len(value) > LARGEST:
+        most = f"{MAX_CONTAINERS:,} lists and dicts" if left[0] < 0 else f"{LARGEST:,} items"
+        raise NotPlainError(f"{where}: more than {most}; store them in a file and give its name")
+    return _plain_dict(value, where, depth, left) if kind is dict else _plain_list(value, where, depth, left)
 
 
-def _plain_dict(value: Mapping[Any, Any], where: str, depth: int) -> dict[str, Any]:
+def _plain_dict(value: Mapping[Any, Any], where: str, depth: int, left: list[int]) -> dict[str, Any]:
     copy: dict[str, Any] = {}
     for key, item in value.items():
         if type(key) is not str:
-            raise NotPlainError(f"{where}: the key {key!r} is not a str")
+            raise NotPlainError(f"{where}: the key {_shown(key)} is not a str")
         kind = type(item)
-        if kind in _SIMPLE:
-            copy[key] = item
-        elif kind is list and depth > 1 and _SIMPLE.issuperset(map(type, item)):
-            copy[key] = item[:]  # as below, without naming the place
+        if kind in _SIMPLE or (kind is int and -_INT64 <= item < _INT64):
+            copy[key] = item  # as below, without naming the place
         else:
-            copy[key] = _plain(item, f"{where}.{key}", depth - 1)
+            copy[key] = _plain(item, f"{where}.{key[:_KEY]}", depth - 1, left)
     return copy
 
 
-def _plain_list(value: Sequence[Any], where: str, depth: int) -> list[Any]:
+def _shown(key: Any) -> str:
+    """A key for people; what an object makes of itself is not asked for."""
+    short = type(key) in _SIMPLE or (type(key) is int and key.bit_length() <= _SHORT_INT)
+    return repr(key)[:_KEY] if short else f"of type {type(key).__name__}"
+
+
+def _plain_list(value: Sequence[Any], where: str, depth: int, left: list[int]) -> list[Any]:
     if _SIMPLE.issuperset(map(type, value)):
         return list(value)
-    return [_plain(item, f"{where}[{index}]", depth - 1) for index, item in enumerate(value)]
+    return [_plain(item, f"{where}[{index}]", depth - 1, left) for index, item in enumerate(value)]
 
 
-def _plain_other(value: Any, where: str, depth: int) -> Any:
+def _plain_other(value: Any, where: str, depth: int, left: list[int]) -> Any:
     if isinstance(value, np.generic):
-        return _plain(value.item(), where, depth - 1)
+        if value.dtype.kind in _NUMPY_KINDS and not isinstance(item := value.item(), np.generic):
+            return _plain(item, where, depth, left)
+        raise NotPlainError(f"{where}: a numpy {value.dtype.name} is not plain data")
     for base, convert in _BASES:
         if isinstance(value, base):
-            return _plain(convert(value), where, depth)
-    if isinstance(value, (list, tuple)):
-        return _plain_list(value, where, depth)
+            return _plain(convert(value), where, depth, left)
+    if isinstance(value, Mapping):
+        items = list(islice(value.items(), _MOST_FOREIGN + 1))
+        if len(items) > _MOST_FOREIGN:
+            raise NotPlainError(f"{where}: a {type(value).__name__} of more than {_MOST_FOREIGN:,} items; use a dict")
+        return _plain(dict(items), where, depth, left)
     remedy = "; use .tolist()" if isinstance(value, np.ndarray) else ""
     raise NotPlainError(f"{where}: a {type(value).__name__} is not plain data{remedy}")
 

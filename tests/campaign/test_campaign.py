@@ -28,7 +28,7 @@ from coordinator.experience.estimates_file import EstimatesFile
 from coordinator.launch import Setting, lockstep_cell
 from coordinator.learning.objective import Question, compare
 from tests.campaign.conftest import SERVICES, TASK, Conduct
-from tests.waiting import until
+from tests.waiting import beat, until
 
 
 def table(folder: Path) -> bytes:

@@ -8,6 +8,7 @@ import os
 import subprocess
 import time
 from pathlib import Path
+from typing import Any
 
 from services.action import Cancelled, Context, Result, Status, error, failure, success
 
@@ -259,3 +260,43 @@ LEAVERS = {
     "fork that returns": _fork_that_returns,
 }
 left: list[subprocess.Popen[bytes]] = []
+
+
+async def order(
+    ctx: Context, *, send: list[dict[str, Any]], seconds: float = 0.0, look: bool = False, ends: str = "success"
+) -> Result:
+    """Send commands, wait a bit, and end as asked, whatever the driver made of the commands."""
+    for body in send:
+        ctx.device.send(body)
+    if seconds:
+        await ctx.sleep(seconds)
+    if look:
+        return success(refused=ctx.device.refused)
+    if ends == "raise":
+        raise ValueError("the action's own words")
+    return success() if ends == "success" else error("own", "the action's own words")
+
+
+async def order_directly(ctx: Context, *, send: list[dict[str, Any]], seconds: float) -> Result:
+    """As `order`, with a driver in the same process."""
+    for body in send:
+        ctx.device.command(ctx.now, body)
+    await ctx.sleep(seconds)
+    return success()
+
+
+async def spin(ctx: Context, *, stubborn: bool = False) -> Result:
+    """Go round and round, and let nobody stop that if `stubborn`."""
+    await ctx.sleep(0.02)
+    while True:
+        try:
+            turn_round()
+        except BaseException:
+            if not stubborn:
+                raise
+
+
+def turn_round() -> None:
+    """Never come back."""
+    while True:
+        pass

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from services.comm.canbus import Frame
@@ -132,3 +134,91 @@ class Eye:
         """Let the source go."""
         if self.images is not None:
             self.images.close()
+
+
+class Broken:
+    """A cyclic device whose driver raises where its key `breaks` says, once an action has sent it `{"break": true}`.
+
+    `sees` is what its `state` and `picture` tell; it counts as moving from `{"go": true}` until it is stopped.
+    """
+
+    def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
+        self.period: float | None = float(config["period"]) if config.get("period") else None
+        self._breaks = str(config.get("breaks", ""))
+        self._armed = bool(config.get("at_once"))
+        self._ports = ports
+        self._moving = False
+        self._file = config.get("file")
+        self._written = ""
+        self._fail("constructor")
+
+    def _fail(self, where: str) -> None:
+        if self._armed and self._breaks == where:
+            raise LookupError(f"nothing is right in {where}")
+
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        """`{"break": true}`, `{"go": true}`, or one of those that are refused."""
+        if body.get("break"):
+            self._armed = True
+        if "odd" in body:
+            raise ValueError(f"the base takes no odd numbers: {body['odd']}")
+        if body.get("need") is True:
+            body["what is not there"]
+        if body.get("block"):
+            time.sleep(float(body["block"]))
+        self._fail("command")
+        self._moving = bool(body.get("go")) or self._moving
+
+    def step(self, now: float) -> None:
+        """Write down whether it moves."""
+        self._fail("step")
+        if self._armed and self._breaks == "event":
+            self._ports.raise_event("e" * 300)
+        self._note()
+
+    def _note(self) -> None:
+        said = "moving" if self._moving else "stopped"
+        if self._file and said != self._written:
+            self._written = said
+            with Path(self._file).open("a", encoding="utf-8") as log:
+                log.write(f"{time.monotonic()} {said}\n")
+
+    def state(self) -> Mapping[str, Any]:
+        """Plain data, as long as it is whole."""
+        self._fail("state")
+        if self._armed and self._breaks == "not_plain":
+            return {"arm": {"pose": object()}}
+        if self._armed and self._breaks == "surrogate":
+            return {"arm": "\ud800"}
+        if self._armed and self._breaks == "huge":
+            return {"arm": bytes(10_000_000)}
+        return {"moving": self._moving}
+
+    def stop(self, now: float) -> None:
+        """Stand still."""
+        self._moving = False
+        self._note()
+        self._fail("stop")
+
+    def stopped(self) -> bool:
+        """Whether it stands."""
+        self._fail("stopped")
+        return not self._moving
+
+    def hold(self, now: float) -> str:
+        """Freeze."""
+        self._fail("hold")
+        return "held"
+
+    def release(self, now: float) -> None:
+        """Go on."""
+        self._fail("release")
+
+    def picture(self) -> Mapping[str, Any]:
+        """What it sees."""
+        self._fail("picture")
+        return {"mime": "image/png", "data": b"", "width": 0, "height": 0, "age": 0.0}
+
+    def close(self) -> None:
+        """Let it go."""
+        self._fail("close")

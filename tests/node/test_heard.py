@@ -1,0 +1,233 @@
+"""Drivers are heard: what one raises, refuses or misses is in the run's error, in `petrobot nodes` and in the node's log."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from coordinator.cli import main
+from services.comm.directory import Directory, parse
+from services.comm.messages import Call
+from services.comm.notice import Accepted
+from tests.node.conftest import OUTSIDE
+from tests.node.test_processes import PATIENCE, ROOT, Operator, operator_of
+from tests.ports import free_ports
+
+pytestmark = pytest.mark.processes
+FAULTS = {
+    "step": "LookupError: nothing is right in step",
+    "state": "LookupError: nothing is right in state",
+    "stopped": "LookupError: nothing is right in stopped",
+    "not_plain": "state.arm.pose: a object is not plain data",
+    "surrogate": "surrogates not allowed",
+    "huge": "do not fit into one datagram",
+    "event": "expected at most 255 characters, found 300",
+}
+"""What a driver does wrong once an action has moved it, and the words that a person is to find."""
+DEVICE = """\
+[devices.the_{name}]
+node = "only"
+driver = "toy_cell.drivers:Broken"
+{period}
+breaks = "{name}"
+[actions.{name}]
+run = "toy_cell.actions:{action}"
+task = "work"
+device = "the_{name}"
+deadline = 20.0
+"""
+NODE = """\
+schema = 1
+[nodes.only]
+host = "127.0.0.1"
+port = {port}
+[actions.add]
+run = "toy_cell.actions:add"
+task = "sum"
+node = "only"
+"""
+
+
+class OneNode:
+    """A node in a process, its standard error in a file."""
+
+    def __init__(self, folder: Path, text: str) -> None:
+        self.file, self.log = folder / "services.toml", folder / "node.log"
+        self.file.write_text(text)
+        self.directory: Directory = parse(text, self.file)
+        self.began = time.monotonic()
+        with self.log.open("w") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "services", "only", "--services", str(self.file)],
+                env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{OUTSIDE}"},
+                stdout=subprocess.PIPE,
+                stderr=log,
+                text=True,
+            )
+
+    def until_ready(self) -> None:
+        assert self.process.stdout is not None
+        assert "ready" in self.process.stdout.readline(), self.log.read_text()
+
+    def stop(self) -> None:
+        self.process.terminate()
+        self.process.communicate(timeout=PATIENCE)
+
+
+def device(name: str, action: str = "order", period: str = "period = 0.004") -> str:
+    return DEVICE.format(name=name, action=action, period=period)
+
+
+def cell(*devices: str) -> str:
+    return NODE.format(port=free_ports(1)[0]) + "".join(devices)
+
+
+@pytest.fixture(scope="module")
+def node(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OneNode]:
+    """A node with a device for each fault, and with some that are told to fail by the node itself."""
+    names = [*FAULTS, "stop", "hold", "picture", "command", "good"]
+    direct = device("plain_stop", "order_directly", "").replace('breaks = "plain_stop"', 'breaks = "stop"')
+    one = OneNode(tmp_path_factory.mktemp("heard"), cell(*map(device, names), direct))
+    one.until_ready()
+    yield one
+    one.stop()
+
+
+@pytest.fixture
+async def operator(node: OneNode) -> AsyncIterator[Operator]:
+    async with operator_of(node.directory, "only") as one:
+        yield one
+
+
+async def works(operator: Operator, name: str) -> None:
+    """The device takes runs again."""
+    end = await operator.call(name, None, send=[], seconds=0.01)
+    assert (end.status, end.text) == ("success", "")
+
+
+@pytest.mark.parametrize("name", FAULTS)
+async def test_what_a_driver_raises_is_its_runs_error(node: OneNode, operator: Operator, name: str) -> None:
+    """The run ends at once with the driver's words, the log has them with a traceback, an innocent run goes on, and the
+    device comes back."""
+    innocent = asyncio.create_task(operator.call("good", None, send=[{"go": True}], seconds=0.5))
+    end = await operator.call(name, None, send=[{"go": True}, {"break": True}], seconds=15.0)
+    assert (end.status, end.cause, end.executed) == ("error", "device_died", "unknown"), end
+    assert FAULTS[name] in end.text and end.seconds < 14.0
+    assert (await innocent).status == "success"
+    log = node.log.read_text()
+    assert "Traceback" in log and FAULTS[name] in log
+    await works(operator, name)
+
+
+async def test_a_stop_routine_that_raises(node: OneNode, operator: Operator) -> None:
+    end = await operator.call("stop", None, send=[{"go": True}, {"break": True}], seconds=0.1, ends="raise")
+    assert end.status == "error" and "nothing is right in stop" in end.text, end
+    await works(operator, "stop")
+
+
+async def test_a_stop_routine_that_raises_beside_its_action(node: OneNode, operator: Operator) -> None:
+    client = operator.clients["only"]
+    call = Call(f"beside {operator.boot}", "plain_stop", {"send": [{"break": True}, {"go": True}], "seconds": 15.0})
+    running = asyncio.create_task(client.call("plain_stop", call.arguments))
+    await operator.heard(Accepted)
+    await asyncio.sleep(0.3)
+    await operator.command("only", "stop", "the_plain_stop")
+    end = await asyncio.wait_for(running, PATIENCE)
+    assert (end.status, end.cause) == ("error", "device_died") and "nothing is right in stop" in end.text, end
+    await works(operator, "plain_stop")
+
+
+async def test_a_hold_that_raises_ends_the_run(node: OneNode, operator: Operator) -> None:
+    running = asyncio.create_task(operator.call("hold", None, send=[{"go": True}, {"break": True}], seconds=15.0))
+    await operator.heard(Accepted)
+    await asyncio.sleep(0.3)
+    await operator.command("only", "hold", "the_hold")
+    end = await running
+    assert (end.status, end.cause) == ("error", "device_died") and "nothing is right in hold" in end.text, end
+    await works(operator, "hold")
+
+
+async def test_a_picture_that_raises_stops_nothing(node: OneNode, operator: Operator) -> None:
+    running = asyncio.create_task(operator.call("picture", None, send=[{"break": True}], seconds=1.0))
+    await operator.heard(Accepted)
+    await asyncio.sleep(0.3)
+    answer = await operator.command("only", "picture", "the_picture")
+    assert answer.data["devices"]["the_picture"].get("mime") is None
+    assert (await running).status == "success"
+    assert "nothing is right in picture" in node.log.read_text()
+
+
+@pytest.mark.parametrize(
+    ("send", "says"),
+    [
+        ([{"odd": 3}], "the base takes no odd numbers: 3"),
+        ([{"odd": 3}, {"go": True}], "the base takes no odd numbers: 3"),
+        ([{"need": True}], "KeyError: 'what is not there'"),
+        ([{"break": True}, {"go": True}], "LookupError: nothing is right in command"),
+    ],
+    ids=["refused", "refused, then another", "KeyError", "any exception"],
+)
+@pytest.mark.parametrize("seconds", [0.0, 0.1], ids=["returns at once", "waits"])
+async def test_a_refusal_that_the_action_does_not_look_at(
+    node: OneNode, operator: Operator, send: list[dict[str, Any]], says: str, seconds: float
+) -> None:
+    name = "command" if "break" in send[0] else "good"
+    end = await operator.call(name, None, send=send, seconds=seconds)
+    assert (end.status, end.cause, end.executed) == ("error", "command_refused", "yes"), end
+    assert says in end.text
+    assert says in node.log.read_text()
+
+
+async def test_an_action_that_looks_decides_itself(operator: Operator) -> None:
+    end = await operator.call("good", None, send=[{"odd": 5}], seconds=0.1, look=True)
+    assert end.status == "success" and end.values == {"refused": "the base takes no odd numbers: 5"}
+    own = await operator.call("good", None, send=[{"odd": 7}], seconds=0.1, ends="error")
+    assert own.cause == "own" and "the base takes no odd numbers: 7" in own.text
+    again = await operator.call("good", None, send=[{"go": True}], seconds=0.1)
+    assert again.status == "success", "what an earlier run was refused is not this one's"
+
+
+async def test_nodes_shows_what_was_refused_and_missed(
+    node: OneNode, operator: Operator, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for number in range(3):
+        await operator.call("good", None, send=[{"odd": number}], seconds=0.05, look=True)
+    slow = await operator.call("good", None, send=[{"block": 1.3}], seconds=2.0)
+    assert slow.status == "success"
+    status = (await operator.command("only", "status", "the_good")).data["devices"]["the_good"]
+    assert status["refused"] >= 3 and status["overruns"] >= 200 and status["late_ms"] >= 1000
+    code = await asyncio.to_thread(main, ["nodes", "--services", str(node.file), "--json", "-"])
+    said = json.loads(capsys.readouterr().out)
+    assert code == 0 and said["only"]["status"]["devices"]["the_good"]["refused"] == status["refused"]
+    code = await asyncio.to_thread(main, ["nodes", "--services", str(node.file)])
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert code == 0 and f"{status['refused']} refused" in shown and "cycles missed" in shown, shown
+    assert "cycles were left out" in node.log.read_text()
+
+
+async def test_a_driver_that_takes_no_commands(operator: Operator) -> None:
+    """The action returns at once; whether its last command is refused cannot be known in time."""
+    end = await operator.call("good", None, send=[{"block": 4.0}, {"go": True}])
+    assert (end.status, end.cause) == ("error", "command_not_taken"), end
+    await asyncio.sleep(3.0)
+
+
+@pytest.mark.parametrize("breaks", ["constructor", "not_plain", "state", "step"])
+def test_a_driver_that_is_broken_from_the_beginning(tmp_path: Path, breaks: str) -> None:
+    """The node says so at once, and does not wait until its devices could have come up."""
+    text = cell(device(breaks).replace("\nbreaks", "\nat_once = true\nbreaks"))
+    one = OneNode(tmp_path, text)
+    out, _ = one.process.communicate(timeout=PATIENCE)
+    took, log = time.monotonic() - one.began, one.log.read_text()
+    assert one.process.returncode == 2 and "ready" not in out
+    assert FAULTS.get(breaks, f"nothing is right in {breaks}") in log.splitlines()[-1], log
+    assert "Traceback" in log and took < 25.0

@@ -1,0 +1,198 @@
+"""Lock step hears drivers as real time does, and names what does not come back."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from services import watchdog
+from services.comm.directory import ActionEntry
+from services.place import InlinePlace
+from services.runs import Begin, Ended, Told
+from tests.node.conftest import OUTSIDE, Clock
+from tests.node.test_heard import FAULTS
+from tests.node.test_processes import PATIENCE, ROOT
+from tests.ports import free_ports
+
+TICK = 0.004
+
+
+class Ports:
+    """No ports but for events."""
+
+    now = 0.0
+
+    def raise_event(self, name: str, **data: Any) -> None:
+        from services.comm.messages import Event
+        from services.context import checked
+
+        checked(Event(name, "it", 1, data))
+
+
+class Inline:
+    """A place with a driver that breaks, in this process."""
+
+    def __init__(self, breaks: str, action: str = "order") -> None:
+        from toy_cell import actions, drivers  # type: ignore[import-not-found]  # tests/node/outside
+
+        self.clock = Clock()
+        self.driver = drivers.Broken({"breaks": breaks, "period": TICK}, Ports())
+        entry = ActionEntry("order", "tests:none", "task", "here", "it")
+        self.place = InlinePlace(
+            {"order": entry},
+            clock=self.clock,
+            driver=self.driver,
+            substitutes={"order": getattr(actions, action)},
+            virtual=True,
+        )
+        self.ends: list[Ended] = []
+        self.told: list[Told] = []
+        self._begun = 0
+
+    def run(self, **arguments: Any) -> Ended:
+        """Begin a run, and give its end."""
+        self._begun += 1
+        identity = f"run{self._begun}"
+        self.place.take(self.clock.now, Begin(identity, "order", arguments, 5.0))
+        for _ in range(2_000):
+            self.place.advance(self.clock.now)
+            for report in self.place.reports():
+                (self.ends if isinstance(report, Ended) else self.told).append(report)  # type: ignore[arg-type]
+            if self.ends and self.ends[-1].id == identity:
+                return self.ends[-1]
+            self.clock.now += TICK
+        raise AssertionError("the run has no end")
+
+
+@pytest.mark.parametrize("breaks", [name for name in FAULTS if name not in ("surrogate", "huge", "not_plain", "state")])
+def test_what_a_driver_raises_is_its_runs_error(breaks: str, caplog: pytest.LogCaptureFixture) -> None:
+    inline = Inline(breaks)
+    end = inline.run(send=[{"go": True}, {"break": True}], seconds=3.0)
+    assert (end.status, end.cause, end.executed) == ("error", "device_died", "unknown"), end
+    assert FAULTS[breaks] in end.text and FAULTS[breaks] in caplog.text and "Traceback" in caplog.text
+    again = inline.run(send=[], seconds=0.1)
+    assert (again.cause, again.executed) == ("not_ready", "no") and FAULTS[breaks] in again.text
+    inline.place.command(inline.clock.now, "c", "status")
+    told = [report for report in inline.place.reports() if isinstance(report, Told)]
+    assert told[0].answer == "not ready" and FAULTS[breaks] in told[0].data["text"]
+    inline.place.close(inline.clock.now)
+
+
+@pytest.mark.parametrize("verb", ["stop", "hold", "release"])
+def test_an_order_that_the_driver_fails_on(verb: str) -> None:
+    inline = Inline(verb)
+    inline.place.take(0.0, Begin("r", "order", {"send": [{"go": True}, {"break": True}], "seconds": 3.0}, 5.0))
+    inline.place.advance(0.0)
+    inline.place.command(0.0, "c", verb)
+    reports = inline.place.reports()
+    assert [(r.cause, f"nothing is right in {verb}" in r.text) for r in reports if isinstance(r, Ended)] == [
+        ("device_died", True)
+    ]
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.1])
+@pytest.mark.parametrize("send", [[{"odd": 1}], [{"odd": 1}, {"go": True}]], ids=["alone", "then another"])
+def test_a_refused_command_in_lock_step(send: list[dict[str, Any]], seconds: float) -> None:
+    inline = Inline("")
+    end = inline.run(send=send, seconds=seconds)
+    assert (end.status, end.cause) == ("error", "command_refused") and "no odd numbers: 1" in end.text
+    assert inline.run(send=[{"go": True}], seconds=seconds).status == "success"
+    looks = inline.run(send=[{"odd": 1}], seconds=0.1, look=True)
+    assert looks.status == "success" and "no odd numbers" in looks.values["refused"]
+
+
+def test_a_good_run_ends_in_the_tick_in_which_it_returns() -> None:
+    """That its commands are known to be taken costs no simulated time."""
+    inline = Inline("")
+    end = inline.run(send=[{"go": True}])
+    assert (end.status, end.seconds, inline.clock.now) == ("success", 0.0, 0.0)
+
+
+HANGING = """\
+schema = 1
+[nodes.only]
+host = "127.0.0.1"
+port = {port}
+[devices.base]
+node = "only"
+driver = "toy_cell.drivers:Broken"
+period = 0.004
+[actions.spin]
+run = "toy_cell.actions:spin"
+task = "work"
+node = "only"
+args = {{ stubborn = {stubborn} }}
+[actions.recover]
+run = "toy_cell.actions:nap"
+task = "recover"
+node = "only"
+args = {{ seconds = 0.01 }}
+"""
+RUN = textwrap.dedent("""\
+    import sys
+    from services import watchdog
+    watchdog.LIMIT, watchdog.LOOK, watchdog.AGAIN, watchdog.ATTEMPTS = 0.4, 0.05, 0.1, 1
+    from services.comm.directory import parse
+    from services.lockstep_node import LockstepNode
+    from services.comm.messages import Call, Hello, Outcome
+    from services.comm.party import Envelope
+    from pathlib import Path
+    file = Path(sys.argv[1])
+    node = LockstepNode(parse(file.read_text(), file), "only")
+    node.receive(0.0, Envelope("only", "coordinator", "only", "call", Hello(1, 1, "coordinator", "coordinator", "b", 1)))
+    node.receive(0.0, Envelope("only", "coordinator", "spin", "call", Call("m/p#1", "spin", epoch=1)))
+    for tick in range(100):
+        node.advance(tick * 0.004)
+        for envelope in node.drain():
+            if isinstance(envelope.body, Outcome):
+                print(envelope.body.status, envelope.body.cause, envelope.body.text)
+                sys.exit(0)
+    print("no end")
+""")
+
+
+@pytest.mark.parametrize("stubborn", [False, True])
+def test_an_action_that_does_not_come_back_is_named(tmp_path: Path, stubborn: bool) -> None:
+    """Its run ends in ERROR, or the process where it lets nobody interrupt it; node, action, run and line are said."""
+    file = tmp_path / "services.toml"
+    file.write_text(HANGING.format(port=free_ports(1)[0], stubborn=str(stubborn).lower()))
+    done = subprocess.run(
+        [sys.executable, "-c", RUN, str(file)],
+        env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{OUTSIDE}"},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+    )
+    said = done.stderr
+    assert "node only: action spin, run m/p#1, in turn_round (" in said and "actions.py:" in said, done
+    if stubborn:
+        assert done.returncode == 3 and "the process ends" in said
+    else:
+        assert done.stdout.startswith("error hung ") and "turn_round (actions.py:" in done.stdout
+
+
+def test_a_busy_machine_does_not_trip_the_watchdog(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Time that a step only waits for its turn on the processor does not count."""
+    dog = watchdog.Watchdog("only")
+    interrupted: list[int] = []
+    monkeypatch.setattr(dog, "_interrupt", interrupted.append)
+    monkeypatch.setattr(watchdog, "_sleeps", lambda thread: False)
+    used = [0.0]
+    monkeypatch.setattr(watchdog, "_processor_time", lambda thread: used[0])
+    dog.begin()
+    for _ in range(10_000):  # an hour and more of looks
+        dog.look()
+    assert not interrupted
+    for _ in range(int(watchdog.LIMIT) + 2):
+        used[0] += 1.0
+        dog.look()
+    assert interrupted
+    dog.end()
+    dog.look()
+    dog.close()
