@@ -15,6 +15,8 @@ import sys
 import time
 from typing import Any
 
+from services.comm.json_text import json_text
+
 STATES, SECONDS, MEMORY = 50_000, 4.0, 256 << 20
 """What one state space may take: markings, seconds of processor time, bytes."""
 HARD_END = 8
@@ -112,7 +114,7 @@ def main() -> int:
     try:
         text = sys.stdin.read()
         for view in ("ordinary", "gspn"):  # verdicts first: a forecast may take long
-            print(json.dumps(analysed(text, sys.argv[1], view)), flush=True)
+            print(json_text(analysed(text, sys.argv[1], view)), flush=True)
     except (ValueError, ArithmeticError) as fault:
         print(fault, file=sys.stderr)
         return 1

@@ -9,6 +9,8 @@ from typing import Any
 
 from aiohttp import web
 
+from services.comm.json_text import json_text
+
 BODY_S = 10.0
 LARGEST_BODY = 2 * 1024 * 1024
 
@@ -33,7 +35,7 @@ async def read_object(request: web.Request) -> dict[str, Any]:
 
 def json_answer(value: Mapping[str, Any] | Sequence[Any], status: int = 200) -> web.Response:
     """An answer that no cache keeps."""
-    body = json.dumps(value, default=str, ensure_ascii=False).encode("utf-8", "replace")  # a lone surrogate is no text
+    body = json_text(value, ensure_ascii=False).encode("utf-8", "replace")  # a lone surrogate is no text
     return web.Response(
         body=body,
         status=status,

@@ -23,6 +23,16 @@ async function need(method, path, body) {
   return null;
 }
 
+/** The emergency stop while there is no live connection; whether it was carried out. */
+export async function stopPastTheLink() {
+  try {
+    const name = localStorage.getItem("petrobot.name") ?? "operator";
+    return (await ask("POST", "/api/command", { verb: "estop", data: {}, name })).ok;
+  } catch {
+    return false;
+  }
+}
+
 export const listTasks = async () => (await need("GET", "/api/tasks")) ?? [];
 export const openTask = (name) => need("GET", `/api/tasks/${encodeURIComponent(name)}`);
 export const loadOffers = async () => (await need("GET", "/api/offers")) ?? [];
