@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
@@ -31,6 +30,7 @@ from coordinator.campaign.rows import Row, rows_of
 from coordinator.campaign.spent import note_block, note_sessions, sessions
 from coordinator.campaign.summary import Summary, result_of
 from coordinator.campaign.table import Table
+from services.comm.json_text import json_text
 from services.comm.whole_file import write_whole
 
 AHEAD = 3
@@ -165,7 +165,7 @@ class Campaign:
         rows = rows_of(block, result)
         plots = self.folder / f"{PLOTS}.json"
         if result[PLOTS] and not plots.exists():
-            write_whole(plots, json.dumps(result[PLOTS], indent=2) + "\n")
+            write_whole(plots, json_text(result[PLOTS], indent=2) + "\n")
         note_block(self.folder, block, result)
         self._note_session(pool)
         self.table.append(rows)

@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from services.comm.json_text import json_text
 from services.comm.whole_file import write_whole
 
 SEEDS = 1_000_000
@@ -55,7 +56,7 @@ class Plan:
 
     def to_plain(self) -> dict[str, Any]:
         """Plain data for manifest and workers."""
-        return json.loads(json.dumps({"schema": SCHEMA, **asdict(self)}))  # type: ignore[no-any-return]
+        return json.loads(json_text({"schema": SCHEMA, **asdict(self)}))  # type: ignore[no-any-return]
 
     @classmethod
     def from_plain(cls, data: Mapping[str, Any]) -> Plan:
@@ -125,7 +126,7 @@ def digest(path: Path | str) -> str:
 
 def write_manifest(folder: Path, plan: Plan) -> None:
     """Keep the plan beside its table."""
-    write_whole(folder / MANIFEST, json.dumps(plan.to_plain(), indent=2) + "\n")
+    write_whole(folder / MANIFEST, json_text(plan.to_plain(), indent=2) + "\n")
 
 
 def read_manifest(folder: Path) -> Plan:

@@ -10,6 +10,7 @@ from typing import Any
 from coordinator.campaign.plan import Block
 from coordinator.campaign.throws import RunEntry, Throw
 from coordinator.task import Kind, Task
+from services.comm.json_text import json_text
 
 GENERAL = (
     "n",
@@ -110,7 +111,7 @@ def _runs(task: Task, throw: Throw | None) -> dict[str, Any]:
 
 
 def _json(data: Any) -> str:
-    return json.dumps(data, separators=(",", ":"), ensure_ascii=False, sort_keys=False)
+    return json_text(data, separators=(",", ":"), ensure_ascii=False)
 
 
 def _text(value: Any) -> str:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
+from services.comm.json_text import json_text
 
 if TYPE_CHECKING:
     import argparse
@@ -136,7 +136,7 @@ def pictures_of(task: Task, result: Mapping[str, Any]) -> dict[str, str]:
 
 def write_json(path: str, data: Any) -> None:
     """Write results as JSON; `-` is standard output."""
-    text = json.dumps(data, indent=2, ensure_ascii=False) + "\n"
+    text = json_text(data, indent=2, ensure_ascii=False) + "\n"
     if path == "-":
         print(text, end="")
         return

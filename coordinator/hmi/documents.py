@@ -1,21 +1,22 @@
-"""The written side over HTTP: task files, what nodes offer, findings of the check, foreign formats, journals."""
+"""The written side over HTTP: task files, what nodes offer, findings of the check, foreign formats, journals.
+
+Nothing here looks into a document: whatever takes its time is done in a process of its own and passed on as it comes.
+"""
 
 from __future__ import annotations
 
-import asyncio
+import json
 from collections.abc import Mapping
 from typing import Any
 
 from aiohttp import web
 
-from coordinator.analysing import analyse_apart
-from coordinator.hmi import verdicts
-from coordinator.hmi.edits import EditError, Rename, parse, plain
+from coordinator.analysing import RefusedError
 from coordinator.hmi.house import HOUSE, House
-from coordinator.hmi.requests import json_answer, read_object
-from coordinator.hmi.store import Conflict, StoreError, TaskText
+from coordinator.hmi.requests import json_answer, read_object, refused, send_json
 
 RENAMES_AT_MOST = 1000
+DESK_AT_MOST = 64
 
 
 def add_routes(app: web.Application) -> None:
@@ -36,86 +37,64 @@ async def _list(request: web.Request) -> web.Response:
     return json_answer(request.app[HOUSE].store.listed())
 
 
-async def _open(request: web.Request) -> web.Response:
+async def _open(request: web.Request) -> web.StreamResponse:
     house = request.app[HOUSE]
-    try:
-        return json_answer(await _described(house, house.store.read(request.match_info["name"])))
-    except StoreError as fault:
-        raise _refusal(fault) from fault
+    given = {**house.store.folders, "name": request.match_info["name"], "where": _where(house)}
+    return await _done(request, "opening", given)
 
 
-async def _save(request: web.Request) -> web.Response:
+async def _save(request: web.Request) -> web.StreamResponse:
     """{base, document, renames} or, to settle a conflict, {base, text}; 409 gives both versions."""
-    house, name = request.app[HOUSE], request.match_info["name"]
-    body = await read_object(request)
-    base = body.get("base")
-    try:
-        if isinstance(body.get("text"), str):
-            saved = house.store.save_text(name, base, body["text"])
-        else:
-            saved = house.store.save(name, base, _document(body), _renames(body))
-    except Conflict as conflict:
-        theirs = await _described(house, conflict.theirs)
-        return json_answer({"conflict": str(conflict), "yours": conflict.yours, "theirs": theirs}, 409)
-    except StoreError as fault:
-        raise _refusal(fault) from fault
-    return json_answer(await _described(house, saved))
-
-
-async def _check(request: web.Request) -> web.Response:
-    """{name, document}: what the check says of a document that is being drawn, and the text that it would be saved as."""
     house = request.app[HOUSE]
     body = await read_object(request)
-    name = str(body.get("name") or "new_task")
-    try:
-        current = house.store.read(name) if name in house.store.names() else None
-        text = house.store.edited_text(current, _document(body), _renames(body))
-    except StoreError as fault:
-        raise _refusal(fault) from fault
-    findings = await asyncio.to_thread(verdicts.findings, text, f"{name}.toml", _where(house))
-    return json_answer({"findings": findings, "text": text})
+    content = {"text": body["text"]} if isinstance(body.get("text"), str) else {"document": _document(body)}
+    about = {**house.store.folders, "name": request.match_info["name"], "where": _where(house)}
+    return await _done(request, "saving", {**about, "base": body.get("base"), "content": content} | _renames(body))
 
 
-async def _analyse(request: web.Request) -> web.Response:
-    """{name, document}: verdicts on a document that is being drawn, and where its time goes; one analysis at a time."""
+async def _check(request: web.Request) -> web.StreamResponse:
+    """{name, document, desk}: what the check says of a document that is being drawn, and the text that it would be saved as.
+
+    What was asked from the same desk before is given up, analyses too: it was about an older drawing.
+    """
     house = request.app[HOUSE]
     body = await read_object(request)
-    name = str(body.get("name") or "new_task")
+    desk = str(body.get("desk") or "")[:DESK_AT_MOST]
+    house.analyses.give_up(desk)
+    return await _done(request, "check", {**_drawing(house, body), "where": _where(house)}, desk)
+
+
+async def _analyse(request: web.Request) -> web.StreamResponse:
+    """{name, document, desk}: verdicts on a document that is being drawn, and where its time goes; one analysis at a time."""
+    house = request.app[HOUSE]
+    body = await read_object(request)
+    desk = str(body.get("desk") or "")[:DESK_AT_MOST]
+    drawing = _drawing(house, body)
     try:
-        current = house.store.read(name) if name in house.store.names() else None
-        text = house.store.edited_text(current, _document(body), _renames(body))
-        async with house.analysing:
-            return json_answer(await analyse_apart(text, f"{name}.toml"))
-    except StoreError as fault:
-        raise _refusal(fault) from fault
-    except ValueError as fault:
-        raise web.HTTPUnprocessableEntity(text=str(fault)) from fault
+        text = json.loads(await house.apart.do("drawing", drawing))["text"]
+        said = await house.analyses.do("analysis", {"text": text, "filename": f"{drawing['name']}.toml"}, desk)
+    except RefusedError as refusal:
+        raise refused(refusal) from refusal
+    return await send_json(request, said)
 
 
 async def _export(request: web.Request) -> web.Response:
-    house, form = request.app[HOUSE], request.match_info["form"]
+    house, name, form = request.app[HOUSE], request.match_info["name"], request.match_info["form"]
     try:
-        task = house.store.read(request.match_info["name"])
-        made = await asyncio.to_thread(verdicts.export, task.text, f"{task.name}.toml", form)
-    except StoreError as fault:
-        raise _refusal(fault) from fault
-    except verdicts.FormatError as fault:
-        raise web.HTTPBadRequest(text=str(fault)) from fault
+        made = json.loads(await house.apart.do("export", {**house.store.folders, "name": name, "form": form}))
+    except RefusedError as refusal:
+        raise refused(refusal) from refusal
     return web.Response(
-        text=made.text,
-        content_type=made.content_type,
-        headers={"Content-Disposition": f'attachment; filename="{task.name}.{form}"', "Cache-Control": "no-store"},
+        text=made["text"],
+        content_type=made["content_type"],
+        headers={"Content-Disposition": f'attachment; filename="{name}.{form}"', "Cache-Control": "no-store"},
     )
 
 
-async def _import(request: web.Request) -> web.Response:
+async def _import(request: web.Request) -> web.StreamResponse:
     """{form, text}: a net in another format as a document to go on drawing."""
     body = await read_object(request)
-    try:
-        text = await asyncio.to_thread(verdicts.imported, str(body.get("form")), str(body.get("text")))
-        return json_answer({"document": plain(parse(text))})
-    except (verdicts.FormatError, EditError) as fault:
-        raise web.HTTPBadRequest(text=str(fault)) from fault
+    return await _done(request, "import", {"form": str(body.get("form")), "text": str(body.get("text"))})
 
 
 async def _offers(request: web.Request) -> web.Response:
@@ -123,41 +102,40 @@ async def _offers(request: web.Request) -> web.Response:
     return json_answer(list(offers()) if offers is not None else [])
 
 
-async def _runs(request: web.Request) -> web.Response:
+async def _runs(request: web.Request) -> web.StreamResponse:
     history = request.app[HOUSE].history
-    return json_answer(list(await history.runs()) if history is not None else [])
+    if history is None:
+        return json_answer([])
+    return await _done(request, "runs", {"folder": str(history.folder)})
 
 
-async def _run(request: web.Request) -> web.Response:
+async def _run(request: web.Request) -> web.StreamResponse:
     history = request.app[HOUSE].history
-    try:
-        if history is None:
-            raise KeyError
-        return json_answer(await history.open(request.match_info["run"]))
-    except KeyError:
-        raise web.HTTPNotFound(text="no such run") from None
+    if history is None:
+        raise web.HTTPNotFound(text="no such run")
+    return await _done(request, "run", {"folder": str(history.folder), "run": request.match_info["run"]})
 
 
-async def _described(house: House, task: TaskText) -> dict[str, Any]:
+async def _done(request: web.Request, work: str, given: Mapping[str, Any], desk: str = "") -> web.StreamResponse:
+    """Have the work done apart, and pass on what came of it."""
     try:
-        document = plain(parse(task.text))
-    except EditError as fault:
-        raise web.HTTPUnprocessableEntity(text=f"{task.name}.toml: {fault}") from fault
-    findings = await asyncio.to_thread(verdicts.findings, task.text, f"{task.name}.toml", _where(house))
-    return {
-        "name": task.name,
-        "revision": task.revision,
-        "own": task.own,
-        "text": task.text,
-        "document": document,
-        "findings": findings,
-    }
+        said = await request.app[HOUSE].apart.do(work, given, desk)
+    except RefusedError as refusal:
+        if refusal.more:
+            return json_answer(refusal.more, refusal.status)
+        raise refused(refusal) from refusal
+    return await send_json(request, said)
 
 
 def _where(house: House) -> dict[str, str] | None:
     if house.offers is None:
         return None
     return {str(offer["action"]): str(offer["node"]) for offer in house.offers()}
+
+
+def _drawing(house: House, body: Mapping[str, Any]) -> dict[str, Any]:
+    named = {"name": str(body.get("name") or "new_task"), "document": _document(body)}
+    return {**house.store.folders, **named, **_renames(body)}
 
 
 def _document(body: Mapping[str, Any]) -> dict[str, Any]:
@@ -167,14 +145,8 @@ def _document(body: Mapping[str, Any]) -> dict[str, Any]:
     return document
 
 
-def _renames(body: Mapping[str, Any]) -> list[Rename]:
+def _renames(body: Mapping[str, Any]) -> dict[str, Any]:
     given = body.get("renames", [])
-    try:
-        return [Rename(tuple(map(str, r["path"])), str(r["old"]), str(r["new"])) for r in given[:RENAMES_AT_MOST]]
-    except (TypeError, KeyError):
-        raise web.HTTPBadRequest(text="a rename is {path, old, new}") from None
-
-
-def _refusal(fault: StoreError) -> web.HTTPException:
-    by_status: dict[int, type[web.HTTPException]] = {404: web.HTTPNotFound, 413: web.HTTPForbidden}
-    return by_status.get(fault.status, web.HTTPBadRequest)(text=str(fault))
+    if not isinstance(given, list):
+        raise web.HTTPBadRequest(text="renames is a list of {path, old, new}")
+    return {"renames": given[:RENAMES_AT_MOST]}

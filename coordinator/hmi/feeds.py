@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from aiohttp import web
 
+from coordinator.analysing import RefusedError
 from coordinator.hmi.house import HOUSE
 from coordinator.hmi.port import PROTOCOL
-from coordinator.hmi.requests import json_answer, read_object
+from coordinator.hmi.requests import json_answer, read_object, refused
 from coordinator.hmi.sessions import LARGEST_MESSAGE, Session, carry_out, who_is
-from coordinator.hmi.store import StoreError
-from coordinator.taskfile import TaskFileError
 
 CLIENTS = 64
 
@@ -50,11 +49,9 @@ async def _start(request: web.Request) -> web.Response:
     if starts is None:
         raise web.HTTPNotFound(text="no run can be started here")
     try:
-        return json_answer(starts(request.match_info["name"]))
-    except StoreError as fault:
-        raise (web.HTTPNotFound if fault.status == 404 else web.HTTPBadRequest)(text=str(fault)) from fault
-    except TaskFileError as fault:
-        raise web.HTTPUnprocessableEntity(text=str(fault)) from fault
+        return json_answer(await starts(request.match_info["name"]))
+    except RefusedError as refusal:
+        raise refused(refusal) from refusal
 
 
 async def _command(request: web.Request) -> web.Response:

@@ -10,6 +10,7 @@ from typing import Any
 
 from aiohttp import web
 
+from coordinator.analysing import Apart
 from coordinator.hmi.doors import Doors
 from coordinator.hmi.gate import Gate
 from coordinator.hmi.port import HistoryPort, MissionPort, OffersPort, StartsPort
@@ -36,7 +37,10 @@ class House:
     gate: Gate | None = None
     sessions: set[Session] = field(default_factory=set)
     commands: set[asyncio.Task[None]] = field(default_factory=set)
-    analysing: asyncio.Lock = field(default_factory=asyncio.Lock)
+    apart: Apart = field(default_factory=Apart)
+    """Where work on documents and journals is done."""
+    analyses: Apart = field(default_factory=Apart)
+    """Where drawings are analysed, which takes so long that nothing else may wait for it."""
     closing: bool = False
     _heard: dict[str, float] = field(default_factory=dict)
     _encoded: OrderedDict[tuple[int, int], str] = field(default_factory=OrderedDict)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from coordinator.analysing import RefusedError
 from coordinator.engine import Engine, Fired, Phase, Report, RunRecorded, StartRun
 from coordinator.hmi.picture import picture
 from coordinator.hmi.telling import reason_of, told
@@ -21,25 +22,24 @@ RECORDS_AT_MOST = 20_000
 RUNS_AT_MOST = 300
 
 
+@dataclass(frozen=True, slots=True)
 class JournalHistory:
     """The runs of one folder (`coordinator.record.runfolder`). Fits `coordinator.hmi.port.HistoryPort`."""
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    folder: Path
 
-    async def runs(self) -> Sequence[Mapping[str, Any]]:
-        """Every run, newest first."""
-        return await asyncio.to_thread(self._runs)
 
-    async def open(self, run: str) -> Mapping[str, Any]:
-        """One run, derived again from its journal. Raises KeyError when there is none of that name."""
-        if run not in {path.parent.name for path in self._folder.glob(f"*/{JOURNAL}")}:
-            raise KeyError(run)
-        return await asyncio.to_thread(opened, self._folder / run / JOURNAL, run)
+def _runs(folder: str) -> list[dict[str, Any]]:
+    """Every run, newest first: {id, task, state, started (ISO 8601 text), seconds}."""
+    paths = sorted(Path(folder).glob(f"*/{JOURNAL}"), key=lambda p: p.stat().st_mtime, reverse=True)
+    return [_listed(path) for path in paths[:RUNS_AT_MOST]]
 
-    def _runs(self) -> list[dict[str, Any]]:
-        paths = sorted(self._folder.glob(f"*/{JOURNAL}"), key=lambda p: p.stat().st_mtime, reverse=True)
-        return [_listed(path) for path in paths[:RUNS_AT_MOST]]
+
+def _run(folder: str, run: str) -> dict[str, Any]:
+    """One run, derived again from its journal: {id, task (as in a snapshot), initial (marking), records}."""
+    if run not in {path.parent.name for path in Path(folder).glob(f"*/{JOURNAL}")}:
+        raise RefusedError(404, "no such run")
+    return opened(Path(folder) / run / JOURNAL, run)
 
 
 def _listed(path: Path) -> dict[str, Any]:
@@ -161,3 +161,7 @@ class _Teller:
             "reason": worst if worst and worst["status"] in ("failure", "error") else None,
             "action": self._actions.get(fired.runs[0], "") if fired.runs else "",
         }
+
+
+WORKS: Mapping[str, Callable[..., Any]] = {"runs": _runs, "run": _run}
+"""For `coordinator.analysing.Apart`."""

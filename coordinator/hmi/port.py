@@ -5,7 +5,8 @@ The shapes are written out in docs/operator-protocol.md, which is also what brow
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Protocol
 
 PROTOCOL = 1
@@ -55,17 +56,15 @@ class MissionPort(Protocol):
 class HistoryPort(Protocol):
     """Where the page finds finished and running journals."""
 
-    async def runs(self) -> Sequence[Mapping[str, Any]]:
-        """Every run, newest first: {id, task, state, started (ISO 8601 text), seconds, records}."""
-
-    async def open(self, run: str) -> Mapping[str, Any]:
-        """One run: {id, task (as in a snapshot), initial (marking), records: [record, ...]}. Raises KeyError."""
+    @property
+    def folder(self) -> Path:
+        """Where each run has a folder of its own."""
 
 
 class StartsPort(Protocol):
     """What may be asked for when a task is started."""
 
-    def __call__(self, name: str, /) -> Mapping[str, Any]:
+    def __call__(self, name: str, /) -> Awaitable[Mapping[str, Any]]:
         """{task, runs ({default, place} or None), seed, modes, parameters: [{name, type, default, text}], learn: {selectors,
         selector, contexts, estimates}} of a task file. Raises StoreError, TaskFileError."""
 

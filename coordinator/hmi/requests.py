@@ -9,8 +9,14 @@ from typing import Any
 
 from aiohttp import web
 
+from coordinator.analysing import RefusedError
+from coordinator.hmi.doors import HEADERS
+from services.comm.json_text import json_text
+
 BODY_S = 10.0
 LARGEST_BODY = 2 * 1024 * 1024
+PIECE = 256 * 1024
+"""Bytes of an answer that are handed over at once."""
 
 
 async def read_object(request: web.Request) -> dict[str, Any]:
@@ -31,9 +37,21 @@ async def read_object(request: web.Request) -> dict[str, Any]:
     return value
 
 
+async def send_json(request: web.Request, text: bytes, status: int = 200) -> web.StreamResponse:
+    """Answer with JSON text that may be long, piece by piece: no other client waits for it."""
+    headers = {**HEADERS, "Cache-Control": "no-store", "Content-Type": "application/json; charset=utf-8"}
+    response = web.StreamResponse(status=status, headers=headers)
+    response.content_length = len(text)
+    await response.prepare(request)
+    for begin in range(0, len(text), PIECE):
+        await response.write(text[begin : begin + PIECE])
+    await response.write_eof()
+    return response
+
+
 def json_answer(value: Mapping[str, Any] | Sequence[Any], status: int = 200) -> web.Response:
     """An answer that no cache keeps."""
-    body = json.dumps(value, default=str, ensure_ascii=False).encode("utf-8", "replace")  # a lone surrogate is no text
+    body = json_text(value, ensure_ascii=False).encode("utf-8", "replace")  # a lone surrogate is no text
     return web.Response(
         body=body,
         status=status,
@@ -41,3 +59,15 @@ def json_answer(value: Mapping[str, Any] | Sequence[Any], status: int = 200) -> 
         charset="utf-8",
         headers={"Cache-Control": "no-store"},
     )
+
+
+def refused(refusal: RefusedError) -> web.HTTPException:
+    """The HTTP answer to work that could not be done."""
+    by_status: dict[int, type[web.HTTPException]] = {
+        404: web.HTTPNotFound,
+        409: web.HTTPConflict,
+        413: web.HTTPForbidden,
+        422: web.HTTPUnprocessableEntity,
+        500: web.HTTPInternalServerError,
+    }
+    return by_status.get(refusal.status, web.HTTPBadRequest)(text=str(refusal))

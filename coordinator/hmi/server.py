@@ -62,6 +62,7 @@ class Page:
             async with asyncio.timeout(LAST_COMMANDS_S):
                 await self.idle()
         await asyncio.gather(*(session.leave() for session in self._house.sessions))
+        await asyncio.gather(self._house.apart.close(), self._house.analyses.close())
         await self._runner.cleanup()
         for task in list(self._house.commands):
             task.cancel()

@@ -15,6 +15,7 @@ from aiohttp import WSCloseCode, WSMsgType, web
 
 from coordinator.hmi.changes import Pending
 from coordinator.hmi.port import PROTOCOL, VERBS, MissionPort
+from services.comm.json_text import json_text
 
 LONGEST_FAULT = 400
 SEND_S = 8.0
@@ -40,8 +41,8 @@ class ProtocolError(Exception):
 
 
 def encode(message: Mapping[str, Any]) -> str:
-    """A message as JSON text. Values that JSON does not know become text: a strange value must not end the feed."""
-    return json.dumps(message, separators=(",", ":"), default=str)
+    """A message as JSON text: whatever a value is, it neither ends the feed nor makes the message unreadable."""
+    return json_text(message, separators=(",", ":"))
 
 
 def who_is(name: str, tab: str) -> str:

@@ -61,6 +61,11 @@ class TaskStore:
         """Where tasks are saved."""
         return self._folder
 
+    @property
+    def folders(self) -> dict[str, str]:
+        """Where its files are, for work in a process of its own."""
+        return {"tasks": str(self._folder), "shipped": str(self._shipped or "")}
+
     def names(self) -> list[str]:
         """All task files."""
         return sorted(self._own() | self._behind())

@@ -1,19 +1,28 @@
-"""What the other rooms say about a task file's text: faults, findings of the check, drawings in other formats."""
+"""Work on task files that may take long for a large net, as plain functions of plain data: open, save, check, convert.
+
+The page's server has all of it done in a process of its own (`coordinator.analysing.Apart`), in the names of `WORKS`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+from coordinator.analysing import RefusedError
 from coordinator.analysis import pnml_writing
 from coordinator.analysis.commands import net_file_of
 from coordinator.analysis.netfile import FormatError as NetFormatError
 from coordinator.analysis.pnml_reading import parse_pnml
 from coordinator.check import check
+from coordinator.hmi.edits import EditError, Rename, parse, plain
 from coordinator.hmi.netfiles import as_task_file
+from coordinator.hmi.store import Conflict, StoreError, TaskStore, TaskText
 from coordinator.task import Task
 from coordinator.taskfile import TaskFileError, dumps, loads
+
+Where = Mapping[str, str] | None
 
 
 class FormatError(ValueError):
@@ -73,3 +82,100 @@ def imported(form: str, text: str) -> str:
         return as_task_file(parse_pnml(text))
     except NetFormatError as error:
         raise FormatError(f"not a place/transition net in PNML: {error}") from error
+
+
+# --- as orders -------------------------------------------------------------------------------------------------------
+
+
+def _store(tasks: str, shipped: str) -> TaskStore:
+    return TaskStore(Path(tasks), Path(shipped) if shipped else None)
+
+
+def _refused(fault: StoreError) -> RefusedError:
+    return RefusedError(fault.status, str(fault))
+
+
+def _described(task: TaskText, where: Where) -> dict[str, Any]:
+    """A task file for the designer: its document, its text, and what the check says of it."""
+    try:
+        document = plain(parse(task.text))
+    except EditError as fault:
+        raise RefusedError(422, f"{task.name}.toml: {fault}") from fault
+    found = findings(task.text, f"{task.name}.toml", where)
+    about = {"name": task.name, "revision": task.revision, "own": task.own}
+    return {**about, "text": task.text, "document": document, "findings": found}
+
+
+def _open(tasks: str, shipped: str, name: str, where: Where) -> dict[str, Any]:
+    try:
+        return _described(_store(tasks, shipped).read(name), where)
+    except StoreError as fault:
+        raise _refused(fault) from fault
+
+
+def _save(
+    tasks: str, shipped: str, name: str, where: Where, base: str | None, content: dict[str, Any], renames: list[Any]
+) -> dict[str, Any]:
+    """`content` is {document}, or {text} to settle a conflict. A conflict is refused with both versions."""
+    store = _store(tasks, shipped)
+    try:
+        if "text" in content:
+            return _described(store.save_text(name, base, content["text"]), where)
+        return _described(store.save(name, base, content["document"], _renames(renames)), where)
+    except Conflict as conflict:
+        both = {"conflict": str(conflict), "yours": conflict.yours, "theirs": _described(conflict.theirs, where)}
+        raise RefusedError(409, str(conflict), both) from conflict
+    except StoreError as fault:
+        raise _refused(fault) from fault
+
+
+def _drawn(tasks: str, shipped: str, name: str, document: dict[str, Any], renames: list[Any]) -> dict[str, Any]:
+    """The text that a drawing would be saved as: {text}."""
+    store = _store(tasks, shipped)
+    try:
+        current = store.read(name) if name in store.names() else None
+        return {"text": store.edited_text(current, document, _renames(renames))}
+    except StoreError as fault:
+        raise _refused(fault) from fault
+
+
+def _check(where: Where, name: str, **drawing: Any) -> dict[str, Any]:
+    """The text that a drawing would be saved as, and what the check says of it."""
+    made = _drawn(name=name, **drawing)
+    return {"findings": findings(made["text"], f"{name}.toml", where), **made}
+
+
+def _export(tasks: str, shipped: str, name: str, form: str) -> dict[str, Any]:
+    try:
+        task = _store(tasks, shipped).read(name)
+        made = export(task.text, f"{task.name}.toml", form)
+    except StoreError as fault:
+        raise _refused(fault) from fault
+    except FormatError as fault:
+        raise RefusedError(400, str(fault)) from fault
+    return {"text": made.text, "content_type": made.content_type}
+
+
+def _import(form: str, text: str) -> dict[str, Any]:
+    try:
+        return {"document": plain(parse(imported(form, text)))}
+    except (FormatError, EditError) as fault:
+        raise RefusedError(400, str(fault)) from fault
+
+
+def _renames(given: list[Any]) -> list[Rename]:
+    try:
+        return [Rename(tuple(map(str, r["path"])), str(r["old"]), str(r["new"])) for r in given]
+    except (TypeError, KeyError):
+        raise RefusedError(400, "a rename is {path, old, new}") from None
+
+
+WORKS: Mapping[str, Callable[..., Any]] = {
+    "opening": _open,
+    "saving": _save,
+    "drawing": _drawn,
+    "check": _check,
+    "findings": findings,
+    "export": _export,
+    "import": _import,
+}

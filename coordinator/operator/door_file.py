@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from coordinator.record.runfolder import DEFAULT, NoRunError, journal_of
+from services.comm.json_text import json_text
 
 DOOR = "operator.json"
 
@@ -36,7 +37,7 @@ def door_open(folder: Path, door: Door) -> Iterator[Path]:
     begun.unlink(missing_ok=True)  # of a coordinator that was killed
     folder.mkdir(parents=True, exist_ok=True)
     with os.fdopen(os.open(begun, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
-        json.dump(asdict(door), file)
+        file.write(json_text(asdict(door)))
     begun.replace(path)  # whole or not at all: somebody may be looking for it
     try:
         yield path

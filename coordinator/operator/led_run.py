@@ -6,7 +6,6 @@ What drives it, in real time or in lock step, is for those who derive from it.
 from __future__ import annotations
 
 import asyncio
-import json
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping
@@ -25,6 +24,7 @@ from coordinator.operator.operation import Operation, Shell
 from coordinator.operator.start_order import learned_of
 from coordinator.record.recording import JournalStore
 from coordinator.record.runfolder import RESULT
+from services.comm.json_text import json_text
 
 
 class LedRun(ABC):
@@ -94,7 +94,7 @@ class LedRun(ABC):
             whole = mission.stage is Stage.OVER
             learned = {} if self._learning is None else learned_of(self._learning, interrupted=not whole)
         result = {**mission.result(self.mode, time.perf_counter() - begun), **learned}
-        text = json.dumps(result, indent=2, ensure_ascii=False) + "\n"
+        text = json_text(result, indent=2, ensure_ascii=False) + "\n"
         await asyncio.to_thread((self.folder / RESULT).write_text, text, encoding="utf-8")
         feed.emit("result", result=result)
 

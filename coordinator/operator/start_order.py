@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import reprlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -17,11 +17,14 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import Item
 
+from coordinator.analysing import RefusedError
 from coordinator.experience.learner import usual_contexts
 from coordinator.experience.learning_session import LearningSession, LearningSetting
+from coordinator.hmi.store import StoreError, TaskStore
 from coordinator.learning.selectors import DEFAULT, RULES
 from coordinator.operator.departure import AGAIN
 from coordinator.task import Task
+from coordinator.taskfile import loads
 from services.comm.directory import Directory
 
 REALTIME, LOCKSTEP = "realtime", "lockstep"
@@ -248,3 +251,15 @@ def _remarks(text: str) -> dict[str, str]:
         return {}
     items = table.items() if hasattr(table, "items") else ()
     return {name: item.trivia.comment.lstrip("# ").strip() for name, item in items if isinstance(item, Item)}
+
+
+def _form(tasks: str, shipped: str, name: str, estimates: str) -> dict[str, Any]:
+    try:
+        text = TaskStore(Path(tasks), Path(shipped) if shipped else None).read(name).text
+    except StoreError as fault:
+        raise RefusedError(fault.status, str(fault)) from fault
+    return start_form(loads(text, f"{name}.toml"), text, Path(estimates))
+
+
+WORKS: Mapping[str, Callable[..., Any]] = {"form": _form}
+"""For `coordinator.analysing.Apart`."""

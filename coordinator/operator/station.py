@@ -8,13 +8,15 @@ emergency stop.
 from __future__ import annotations
 
 import asyncio
+import json
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from coordinator.hmi import verdicts
+from coordinator.analysing import Apart
 from coordinator.hmi.feed import Feed
 from coordinator.hmi.narrator import Narrator
+from coordinator.hmi.picture import picture
 from coordinator.hmi.store import StoreError, TaskStore, TaskText
 from coordinator.mission.asking import ask_all
 from coordinator.mission.partners import FirstAlternative
@@ -23,7 +25,7 @@ from coordinator.operator.controls import Answer, Controls, refusal
 from coordinator.operator.door_file import Door
 from coordinator.operator.emergency import CLEAR, STOP, order_all
 from coordinator.operator.simulated_run import SimulatedRun
-from coordinator.operator.start_order import LOCKSTEP, StartOrder, read_start, start_form
+from coordinator.operator.start_order import LOCKSTEP, StartOrder, read_start
 from coordinator.operator.starting import FAULTS, Starting
 from coordinator.operator.watching import shown_selectors
 from coordinator.task import Task
@@ -74,6 +76,7 @@ class Station:
         self._choices: dict[str, str] = {}
         self._nodes: Mapping[str, Any] = {}
         self._run: Run | None = None
+        self._apart = Apart()
         self._starting = self._stopped = False
         self._going: asyncio.Task[None] | None = None
         self._looking = asyncio.get_running_loop().create_task(self._look())
@@ -82,7 +85,7 @@ class Station:
     async def close(self) -> None:
         """Abort the run that goes on and leave."""
         self._looking.cancel()
-        await asyncio.gather(self._looking, return_exceptions=True)
+        await asyncio.gather(self._looking, self._apart.close(), return_exceptions=True)
         going, run = self._going, self._run
         if going is None or run is None:
             return
@@ -144,22 +147,25 @@ class Station:
         """Every action that services.toml places, and whether its node is up and says that it offers it."""
         return offered(self.directory, lambda action, node: action in self._nodes.get(node, {}).get("offers", ()))
 
-    def form(self, name: str) -> Mapping[str, Any]:
-        """What may be asked for when a task is started. Raises StoreError, TaskFileError."""
-        text = self._tasks.read(name)
-        return start_form(loads(text.text, f"{name}.toml"), text.text, self._starting_by.estimates)
+    async def form(self, name: str) -> Mapping[str, Any]:
+        """What may be asked for when a task is started. Raises RefusedError."""
+        given = {**self._tasks.folders, "name": name, "estimates": str(self._starting_by.estimates)}
+        said: dict[str, Any] = json.loads(await self._apart.do("form", given))
+        return said
 
     # --- a task, and a run of it -----------------------------------------------------------------------------------
 
     async def _load(self, who: str, data: Mapping[str, Any]) -> Answer:
         """Show a task at its initial marking, to look at it and set breakpoints before it is started."""
-        if self._busy:
-            return self._busy_answer()
+        if (busy := self._busy()) is not None:
+            return busy
         try:
             text = self._tasks.read(str(data["task"]))
-            task = loads(text.text, f"{text.name}.toml")
+            task = await asyncio.to_thread(_prepared, text)
         except (StoreError, TaskFileError) as fault:
             return refusal("task", str(fault))
+        if (busy := self._busy()) is not None:  # a run was started meanwhile
+            return busy
         self._forget(text.name)
         self._narrator(task).begin("", "realtime", **self._kept(task))
         self.feed.emit("mission", mission={"file": text.name})
@@ -168,8 +174,8 @@ class Station:
     async def _start(self, who: str, data: Mapping[str, Any]) -> Answer:
         if self._going is not None and self.feed.state["mission"]["state"] in OVER:
             await asyncio.wait({self._going}, timeout=LAST_WORDS)  # it only hangs up yet
-        if self._busy:
-            return self._busy_answer()
+        if (busy := self._busy()) is not None:
+            return busy
         if self._stopped:
             return refusal("stopped", "the emergency stop stands; clear it first")
         self._starting = True  # nobody else may come in between
@@ -178,11 +184,9 @@ class Station:
         finally:
             self._starting = False
 
-    @property
-    def _busy(self) -> bool:
-        return self._starting or self._run is not None
-
-    def _busy_answer(self) -> Answer:
+    def _busy(self) -> Answer | None:
+        if not self._starting and self._run is None:
+            return None
         mission = self.feed.state["mission"]
         return refusal("running", f"{mission['id'] or 'a mission run'} goes on; abort it, or wait for its end")
 
@@ -194,7 +198,7 @@ class Station:
             return refusal("task", "choose a task first")
         try:
             text = self._tasks.read(name)
-            task = loads(text.text, f"{name}.toml")
+            task = await asyncio.to_thread(_prepared, text)
         except (StoreError, TaskFileError) as fault:
             return refusal("faults", str(fault))
         if (faulty := await self._faults(text)) is not None:
@@ -223,7 +227,8 @@ class Station:
     async def _faults(self, text: TaskText) -> Answer | None:
         """Why a task may not run: what the check finds."""
         where = {action: entry.node for action, entry in self.directory.actions.items()}
-        found = await asyncio.to_thread(verdicts.findings, text.text, f"{text.name}.toml", where)
+        given = {"text": text.text, "filename": f"{text.name}.toml", "where": where}
+        found = json.loads(await self._apart.do("findings", given))
         faults = [finding for finding in found if finding["severity"] == "error"]
         if not faults:
             return None
@@ -335,6 +340,13 @@ class Station:
             state = {"state": "up", "text": ""} if answer["up"] else {"state": "lost", "text": answer.get("why") or ""}
             if self.feed.state["nodes"].get(name) != state:
                 self.feed.emit("node", name=name, node=state)
+
+
+def _prepared(text: TaskText) -> Task:
+    """A task with what is derived from it once and takes long for a large net. Raises TaskFileError."""
+    task = loads(text.text, f"{text.name}.toml")
+    picture(task)
+    return task
 
 
 def offered(directory: Directory, up: Callable[[str, str], bool]) -> list[dict[str, Any]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from xml.sax.saxutils import quoteattr
@@ -10,11 +9,12 @@ from xml.sax.saxutils import quoteattr
 from coordinator.engine import Corrected, Fired, RunRecorded, StartRun, to_plain
 from coordinator.record.journal import Journal
 from coordinator.record.recording import Step
+from services.comm.json_text import json_text
 
 
 def jsonl(journal: Journal, steps: Iterator[Step]) -> Iterator[str]:
     """One line for the header, then one for each stimulus with the instructions that followed."""
-    yield json.dumps({"kind": "header", **journal.header}, ensure_ascii=False)
+    yield json_text({"kind": "header", **journal.header}, ensure_ascii=False)
     for step in steps:
         line = {
             "number": step.number,
@@ -23,7 +23,7 @@ def jsonl(journal: Journal, steps: Iterator[Step]) -> Iterator[str]:
             "instructions": [to_plain(instruction) for instruction in step.instructions],
             "marking": list(step.state.marking),
         }
-        yield json.dumps(line, ensure_ascii=False)
+        yield json_text(line, ensure_ascii=False)
 
 
 def xes(journal: Journal, steps: Iterator[Step]) -> Iterator[str]:

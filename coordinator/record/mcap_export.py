@@ -7,7 +7,6 @@ counted from the date in the journal's header.
 from __future__ import annotations
 
 import importlib
-import json
 from collections.abc import Iterable, Iterator, Mapping
 from datetime import datetime
 from pathlib import Path
@@ -17,6 +16,7 @@ from coordinator.engine import Corrected, Fired, Instruction, Report, RunRecorde
 from coordinator.net import Net
 from coordinator.record.journal import Journal
 from coordinator.record.recording import Step
+from services.comm.json_text import json_text
 
 _TEXT: Final = {"type": "string"}
 _NUMBER: Final = {"type": "number"}
@@ -56,7 +56,7 @@ def write_mcap(path: Path, journal: Journal, net: Net, steps: Iterable[Step]) ->
         writer.add_metadata("petrobot", {k: str(journal.header[k]) for k in ("mission", "mode", "date", "seed")})
         channels = {name: _channel(writer, name) for name in CHANNELS}
         for count, (name, time, message) in enumerate(messages(journal, net, steps), 1):
-            data = json.dumps(message, ensure_ascii=False).encode()
+            data = json_text(message, ensure_ascii=False).encode()
             writer.add_message(channels[name], log_time=time, publish_time=time, sequence=count, data=data)
         writer.finish()
     return count
@@ -95,5 +95,5 @@ def _told(one: Instruction) -> tuple[str, dict[str, Any]] | None:
 
 def _channel(writer: Any, name: str) -> int:
     schema = {"type": "object", "title": f"petrobot.{name}", "properties": CHANNELS[name]}
-    schema_id = writer.register_schema(f"petrobot.{name}", "jsonschema", json.dumps(schema).encode())
+    schema_id = writer.register_schema(f"petrobot.{name}", "jsonschema", json_text(schema).encode())
     return int(writer.register_channel(f"/petrobot/{name}", "json", schema_id))

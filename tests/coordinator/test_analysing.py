@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import json
+import os
 import signal
 import subprocess
 import sys
+from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
 
 from coordinator import analysing
-from coordinator.analysing import analyse_apart, analysed
+from coordinator.analysing import Apart, RefusedError, Superseded, analyse_apart, analysed
 
 CATCH_BALL = (Path(analysing.__file__).parent / "tasks" / "catch_ball.toml").read_text(encoding="utf-8")
 
@@ -43,14 +48,15 @@ def test_the_kernel_ends_one_that_takes_too_much_processor_time() -> None:
     spinning = (
         "from itertools import repeat\n"
         "from coordinator import analysing\n"
-        "analysing.HARD_END = 1\n"
+        "analysing.HARD_END = 0\n"
         "analysing.analysed = lambda text, name, view: all(repeat(1)) if view == 'gspn' else {'said': 1}\n"
         "analysing.main()\n"
     )
+    order = b'{"work": "analysis", "given": {"text": "", "filename": "drawn.toml"}}\n'
     ended = subprocess.run(
-        [sys.executable, "-c", spinning, "drawn.toml"], input=b"", capture_output=True, check=False, timeout=600.0
+        [sys.executable, "-c", spinning], input=order, capture_output=True, check=False, timeout=600.0
     )
-    assert ended.returncode == -signal.SIGKILL
+    assert ended.returncode == -signal.SIGXCPU
     assert ended.stdout == b'{"said": 1}\n', "what was known before is told"
 
 
@@ -68,3 +74,69 @@ async def test_one_that_does_not_end_is_given_up(said: str, tmp_path: Path, monk
     else:
         with pytest.raises(ValueError, match="took too long"):
             await analyse_apart("", "drawn.toml")
+
+
+@pytest.fixture
+async def apart() -> AsyncIterator[Apart]:
+    made = Apart()
+    yield made
+    await made.close()
+
+
+FINDINGS = {"text": CATCH_BALL, "filename": "catch_ball.toml", "where": None}
+
+
+@pytest.mark.processes
+async def test_one_process_carries_out_orders_one_after_the_other(apart: Apart) -> None:
+    first = await apart.do("findings", FINDINGS)
+    process = apart.process
+    several = await asyncio.gather(*(apart.do("findings", FINDINGS) for _ in range(3)))
+    assert several == [first] * 3
+    assert apart.process == process is not None
+    with pytest.raises(RefusedError, match="no such run"):
+        await apart.do("run", {"folder": "nowhere", "run": "none"})
+    assert await apart.do("findings", FINDINGS) == first, "a refusal does not end it"
+
+
+@pytest.mark.processes
+async def test_it_stands_below_all_others_and_away_from_the_keyboard(apart: Apart) -> None:
+    await apart.do("findings", FINDINGS)
+    assert apart.process is not None
+    assert os.getpriority(os.PRIO_PROCESS, apart.process) >= 10
+    assert os.getpgid(apart.process) == apart.process, "Ctrl-C is for the coordinator"
+
+
+@pytest.mark.processes
+async def test_a_newer_drawing_takes_the_place_of_the_older_one(apart: Apart) -> None:
+    """Running or waiting, the older ones are given up at once; those of other desks and other work are not."""
+    endless = {"text": CATCH_BALL.replace("tokens = 4", "tokens = 4000"), "filename": "catch_ball.toml"}
+    first = asyncio.create_task(apart.do("analysis", endless, "desk 1"))
+    while apart.process is None:
+        await asyncio.sleep(0)
+    other = asyncio.create_task(apart.do("findings", FINDINGS, "desk 2"))
+    second = asyncio.create_task(apart.do("analysis", endless, "desk 1"))
+    third = asyncio.create_task(apart.do("findings", FINDINGS, "desk 1"))
+    async with asyncio.timeout(60):
+        done = await asyncio.gather(first, other, second, third, return_exceptions=True)
+    assert [isinstance(each, Superseded) for each in done] == [True, False, True, False]
+
+
+@pytest.mark.processes
+async def test_one_that_was_killed_is_started_again(apart: Apart) -> None:
+    await apart.do("findings", FINDINGS)
+    assert apart.process is not None
+    os.kill(apart.process, signal.SIGKILL)
+    with contextlib.suppress(RefusedError):  # whoever asks first may find it dying
+        await apart.do("findings", FINDINGS)
+    assert json.loads(await apart.do("findings", FINDINGS)) is not None
+
+
+@pytest.mark.processes
+async def test_an_order_that_is_not_wanted_any_more_ends_its_process(apart: Apart) -> None:
+    order = asyncio.create_task(apart.do("findings", FINDINGS))
+    while apart.process is None:
+        await asyncio.sleep(0)
+    order.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await order
+    assert apart.process is None

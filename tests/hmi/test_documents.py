@@ -13,12 +13,29 @@ import pytest
 import pytest_asyncio
 
 from coordinator.analysis.pnml_reading import parse_pnml
+from coordinator.hmi import edits, journals, store, verdicts
+from coordinator.hmi.doors import HEADERS
 from coordinator.hmi.netfiles import as_task_file
 from coordinator.hmi.server import Page
 from coordinator.taskfile import load, loads
 from tests.hmi.stage import Stage
 
 TASK = "pick_and_place"
+
+FORBIDDEN = (
+    (edits, "parse"),
+    (edits, "edited"),
+    (store, "edited"),
+    (store, "parse"),
+    (verdicts, "parse"),
+    (verdicts, "loads"),
+    (verdicts, "check"),
+    (verdicts, "parse_pnml"),
+    (journals, "read_journal"),
+    (journals, "replay"),
+    (journals, "loads"),
+)
+"""What takes longer than a turn of the loop may for a large net or a long journal."""
 
 
 @pytest_asyncio.fixture
@@ -226,3 +243,37 @@ async def test_the_page_and_the_journal_tell_the_same(http: aiohttp.ClientSessio
     async with http.get(f"/api/runs/{run}") as answer:
         records = (await answer.json())["records"]
     assert [(f["transition"], f["error"]) for r in records for f in r["firings"]] == live
+
+
+async def test_nothing_that_takes_long_is_done_in_the_coordinator(
+    http: aiohttp.ClientSession, stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither in its loop nor in a thread of it, which would share the interpreter with the mission that is running."""
+    await stage.command("ana", "take_controls", {})
+    await stage.command("ana", "start", {"task": TASK})
+
+    def forbidden(*_: object, **__: object) -> None:
+        raise AssertionError("done in the coordinator's own process")
+
+    for module, name in FORBIDDEN:
+        monkeypatch.setattr(module, name, forbidden)
+    task = await opened(http)
+    document = {**task["document"], "task": {**task["document"]["task"], "text": "altered"}}
+    drawn = {"name": TASK, "document": document, "desk": "mine"}
+    status, saved = await save(http, TASK, base=task["revision"], document=document)
+    assert status == 200 and saved["document"]["task"]["text"] == "altered"
+    async with http.get(f"/api/tasks/{TASK}/export/pnml") as answer:
+        pnml = await answer.text()
+    for path, body in {
+        "/api/check": drawn,
+        "/api/analyse": drawn,
+        "/api/import": {"form": "pnml", "text": pnml},
+    }.items():
+        async with http.post(path, json=body) as answer:
+            assert answer.status == 200, (path, await answer.text())
+            assert answer.headers.keys() >= HEADERS.keys(), path
+    async with http.get("/api/runs") as answer:
+        (run,) = await answer.json()
+    async with http.get(f"/api/runs/{run['id']}") as answer:
+        assert answer.status == 200 and (await answer.json())["records"]
+        assert answer.headers.keys() >= HEADERS.keys()

@@ -275,7 +275,7 @@ async def test_a_run_in_lock_step_learns(cell: Simulated, tmp_path: Path) -> Non
     assert first["learned"] == {"file": "mine.db", "selector": "thompson", "context": "", "runs_counted": 12}
     assert {a["action"] for a in cell.state["selectors"]["look"]["alternatives"] if "j" in a}
     assert {r["y"] for r in cell.state["reports"].values()} == {"probability", "J"}
-    assert cell.station.form("moving")["learn"]["estimates"] == ["mine"]
+    assert (await cell.station.form("moving"))["learn"]["estimates"] == ["mine"]
     _, second = await cell.simulate(runs=1, learn={**learn, "frozen": True})
     assert second["learned"]["runs_counted"] == 0
     refused = await cell.say("start", task="moving", mode="lockstep", learn={"file": "none_yet", "frozen": True})

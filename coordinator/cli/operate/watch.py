@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import json
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from coordinator.cli import CommandError
 from coordinator.cli.operate import hand
+from services.comm.json_text import json_text
 
 if TYPE_CHECKING:
     from coordinator.hmi.client import OperatorClient
@@ -53,9 +53,9 @@ async def _watch(options: argparse.Namespace, out: TextIO) -> int:
 
 
 async def _follow(client: OperatorClient, out: TextIO, plain: bool) -> int:
-    _write(out, _snapshot(client) if plain else json.dumps({"kind": "snapshot", **client.state}, default=str))
+    _write(out, _snapshot(client) if plain else json_text({"kind": "snapshot", **client.state}))
     async for change in client.changes():
-        text = _line(change) if plain else json.dumps(change, default=str)
+        text = _line(change) if plain else json_text(change)
         if text:
             _write(out, text)
         state = client.state["mission"]["state"]

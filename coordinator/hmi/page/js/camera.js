@@ -4,6 +4,7 @@ import { attribute, fill, h, s, seconds, text, words } from "./dom.js";
 
 const GLYPH = 0.62; // widths of a letter and heights of a line, in font sizes
 const LINE = 1.15;
+const NO_VALUE = "–";
 const COLOUR = { predicted: "predicted", found: "found" };
 
 function shape(d) {
@@ -52,7 +53,7 @@ class Frame {
     attribute(this.image, "href", `data:${mime};base64,${image.data}`);
     const seen = image.detections ?? [];
     fill(this.over, seen.map(shape), labels(seen.filter((d) => d.label), width, height));
-    text(this.note, [image.age !== undefined ? `${Math.round(image.age * 1000)} ms old` : "", image.note].filter(Boolean).join(" · "));
+    text(this.note, [Number.isFinite(image.age) ? `${Math.round(image.age * 1000)} ms old` : "", image.note].filter(Boolean).join(" · "));
   }
 }
 
@@ -98,11 +99,12 @@ export class Devices {
 
   card(name, device) {
     const joints = (device.joints ?? []).map((angle, i) => {
-      const [low, high] = device.limits?.[i] ?? [-Math.PI, Math.PI];
+      if (!Number.isFinite(angle)) return h("li", {}, h("span", {}, `J${i + 1}`), h("span"), h("span", { class: "number" }, NO_VALUE));
+      const [low, high] = device.limits?.[i]?.every(Number.isFinite) ? device.limits[i] : [-Math.PI, Math.PI];
       const part = Math.max(0, Math.min(1, (angle - low) / (high - low || 1)));
       return h("li", {}, h("span", {}, `J${i + 1}`), h("meter", { min: 0, max: 1, value: part.toFixed(3) }), h("span", { class: "number" }, `${((angle * 180) / Math.PI).toFixed(1)}°`));
     });
-    const values = Object.entries(device.values ?? {}).map(([key, value]) => h("div", {}, h("dt", {}, words(key)), h("dd", {}, typeof value === "number" ? value.toPrecision(4) : String(value))));
-    return h("article", { class: "device" }, h("h3", {}, words(name), h("span", { class: `chip ${device.level ?? ""}` }, words(device.state ?? ""))), joints.length ? h("ol", { class: "joints" }, joints) : null, values.length ? h("dl", {}, values) : null, device.age !== undefined ? h("p", { class: "muted" }, `${seconds(device.age)} old`) : null);
+    const values = Object.entries(device.values ?? {}).map(([key, value]) => h("div", {}, h("dt", {}, words(key)), h("dd", {}, typeof value === "number" ? value.toPrecision(4) : String(value ?? NO_VALUE))));
+    return h("article", { class: "device" }, h("h3", {}, words(name), h("span", { class: `chip ${device.level ?? ""}` }, words(device.state ?? ""))), joints.length ? h("ol", { class: "joints" }, joints) : null, values.length ? h("dl", {}, values) : null, Number.isFinite(device.age) ? h("p", { class: "muted" }, `${seconds(device.age)} old`) : null);
   }
 }

@@ -23,6 +23,16 @@ async function need(method, path, body) {
   return null;
 }
 
+/** The emergency stop while there is no live connection; whether it was carried out. */
+export async function stopPastTheLink() {
+  try {
+    const name = localStorage.getItem("petrobot.name") ?? "operator";
+    return (await ask("POST", "/api/command", { verb: "estop", data: {}, name })).ok;
+  } catch {
+    return false;
+  }
+}
+
 export const listTasks = async () => (await need("GET", "/api/tasks")) ?? [];
 export const openTask = (name) => need("GET", `/api/tasks/${encodeURIComponent(name)}`);
 export const loadOffers = async () => (await need("GET", "/api/offers")) ?? [];
@@ -31,20 +41,26 @@ export const openRun = (run) => need("GET", `/api/runs/${encodeURIComponent(run)
 export const startForm = (name) => need("GET", `/api/start/${encodeURIComponent(name)}`);
 export const importNet = (form, text) => need("POST", "/api/import", { form, text });
 
-/** What the check says of a document; null when the server cannot tell. */
+/** This window's desk: a newer drawing of it takes the place of the one that is checked or analysed just now. */
+const DESK = Array.from(crypto.getRandomValues(new Uint8Array(8)), (b) => b.toString(16).padStart(2, "0")).join("");
+const SUPERSEDED = 409;
+
+/** What the check says of a document; null when the server cannot tell, or was asked about a newer one. */
 export async function checkDocument(name, document, renames) {
   try {
-    const answer = await ask("POST", "/api/check", { name, document, renames });
+    const answer = await ask("POST", "/api/check", { name, document, renames, desk: DESK });
+    if (answer.status === SUPERSEDED) return null;
     return answer.ok ? answer.value : { findings: [{ severity: "error", key: "", text: String(answer.value), remedy: "" }], text: "" };
   } catch {
     return null;
   }
 }
 
-/** Verdicts on a document; a text says why there are none. */
+/** Verdicts on a document; a text says why there are none, null that a newer drawing was checked meanwhile. */
 export async function analyseDocument(name, document, renames) {
   try {
-    const answer = await ask("POST", "/api/analyse", { name, document, renames });
+    const answer = await ask("POST", "/api/analyse", { name, document, renames, desk: DESK });
+    if (answer.status === SUPERSEDED) return null;
     return answer.ok ? answer.value : String(answer.value);
   } catch {
     return "the server cannot be reached";

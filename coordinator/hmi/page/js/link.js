@@ -6,6 +6,7 @@ const LOST_AFTER_MS = 3500;
 const RETRY_MS = [250, 500, 1000, 2000, 4000];
 const ANSWER_MS = 20000;
 const GOING_AWAY = 1001;
+const UNKNOWN_HERE = 401;
 
 /** A tab's secret: it stays the same operator after a refresh. */
 function tabSecret() {
@@ -22,7 +23,10 @@ export class Link {
   constructor(painted) {
     this.state = emptyState();
     this.connected = false;
+    this.everConnected = false;
     this.goodbye = false; // the server said that it ends, so nothing was lost
+    this.refused = false; // a coordinator answers, but it does not know this browser: it was started again with another key
+    this.fault = ""; // why what came could not be read or shown
     this.gaps = 0;
     this.deltas = 0;
     this.lastPaint = 0;
@@ -46,28 +50,61 @@ export class Link {
     const socket = new WebSocket(`${scheme}://${location.host}/api/live`);
     this.socket = socket;
     this.heardAt = performance.now();
+    let met = false;
     socket.onopen = () => {
+      met = true;
+      this.refused = false;
       const name = localStorage.getItem("petrobot.name") ?? "operator";
       socket.send(JSON.stringify({ type: "hello", protocol: 1, name, tab: tabSecret() }));
     };
-    socket.onmessage = (event) => this.hear(JSON.parse(event.data));
+    socket.onmessage = (event) => this.receive(socket, event.data);
     socket.onclose = (event) => {
       if (socket === this.socket && event.code === GOING_AWAY && event.reason) this.goodbye = true;
+      if (socket === this.socket && !met) this.askWhy();
       this.lost(socket);
     };
   }
 
   lost(socket) {
-    if (socket !== this.socket) return;
+    if (!socket || socket !== this.socket) return;
     this.socket = null;
     this.meet();
-    if (this.connected) {
-      this.connected = false;
-      this.note("connection");
-    }
+    this.connected = false;
+    this.note("connection");
     for (const answer of this.answers.values()) answer({ ok: false, code: "lost", text: "the connection was lost" });
     this.answers.clear();
     setTimeout(() => this.open(), RETRY_MS[Math.min(this.tries++, RETRY_MS.length - 1)]);
+  }
+
+  /** A browser is not told why its WebSocket was turned away; a plain request says whether the key is the reason. */
+  async askWhy() {
+    try {
+      const { status } = await fetch("/page/icon.svg", { method: "HEAD", cache: "no-store" });
+      this.refused = status === UNKNOWN_HERE;
+    } catch {
+      this.refused = false; // nobody answers at all
+    }
+    this.note("connection");
+  }
+
+  /** A message that cannot be read is a lost connection: what it said is missing from here on. */
+  receive(socket, data) {
+    if (socket !== this.socket) return;
+    try {
+      this.hear(JSON.parse(data));
+    } catch (fault) {
+      this.broken(fault);
+    }
+  }
+
+  /** What came cannot be read or shown: say so, and begin again with a fresh snapshot. */
+  broken(fault) {
+    console.error(fault);
+    this.fault = String(fault?.message ?? fault);
+    const { socket } = this;
+    this.waiting = [];
+    this.lost(socket);
+    socket?.close();
   }
 
   watch() {
@@ -112,13 +149,24 @@ export class Link {
     const messages = this.waiting;
     this.waiting = [];
     const changes = [];
-    for (const message of messages) {
-      if (message.type === "snapshot") this.takeSnapshot(message, changes);
-      else if (message.type === "delta") this.takeDelta(message, changes);
+    try {
+      for (const message of messages) {
+        if (message.type === "snapshot") this.takeSnapshot(message, changes);
+        else if (message.type === "delta") this.takeDelta(message, changes);
+      }
+      const changed = this.changed;
+      this.changed = new Set();
+      this.painted(changed, changes);
+    } catch (fault) {
+      this.broken(fault);
+      return;
     }
-    const changed = this.changed;
-    this.changed = new Set();
-    this.painted(changed, changes);
+    if (!this.connected) return;
+    this.tries = 0; // only now: a snapshot that cannot be shown must not be asked for four times a second
+    if (this.fault) {
+      this.fault = "";
+      this.note("connection");
+    }
   }
 
   takeSnapshot(message, changes) {
@@ -127,8 +175,7 @@ export class Link {
     this.clock(this.state.time);
     changes.length = 0;
     this.changed.add("all");
-    this.tries = 0;
-    this.connected = true;
+    this.connected = this.everConnected = true;
     this.goodbye = false;
     this.meet();
     document.documentElement.dataset.sequence = String(this.state.sequence);
@@ -152,7 +199,7 @@ export class Link {
   }
 
   clock(time) {
-    this.state.time = Math.max(time, 0);
+    this.state.time = Math.max(0, [time, this.state.time, 0].find(Number.isFinite));
     this.receivedAt = performance.now();
   }
 

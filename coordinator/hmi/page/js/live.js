@@ -182,7 +182,7 @@ export class Live {
   cardClock(node, now) {
     const { run } = node;
     const limit = run.deadline ? ` of ${seconds(run.deadline)}` : "";
-    text(node.parts.time, `${seconds(Math.max(0, now - run.started))}${limit}`);
+    text(node.parts.time, Number.isFinite(run.started) ? `${seconds(Math.max(0, now - run.started))}${limit}` : "");
     attribute(node, "data-late", run.deadline && now - run.started > 0.8 * run.deadline ? "" : null);
   }
 
@@ -234,7 +234,7 @@ export class Live {
       const [, title, detail, number] = row.children;
       text(title, name);
       text(detail, node.state === "up" ? (node.held ? words(node.held) : "") : `${words(node.state)}${node.text ? `: ${node.text}` : ""}`);
-      text(number, node.round_trip !== undefined && node.state === "up" ? `${(node.round_trip * 1000).toFixed(1)} ms` : "");
+      text(number, Number.isFinite(node.round_trip) && node.state === "up" ? `${(node.round_trip * 1000).toFixed(1)} ms` : "");
     });
     if (!list.length) this.nodes.content.dataset.empty = "No node is known.";
     else delete this.nodes.content.dataset.empty;
@@ -353,7 +353,7 @@ class Dock {
     const times = [...new Set(streams.flatMap((n) => setpoints[n].samples.map(([t]) => t)))].sort((a, b) => a - b);
     const columns = streams.map((n) => {
       const by = new Map(setpoints[n].samples);
-      return times.map((t) => (by.has(t) ? by.get(t) * 1000 : null));
+      return times.map((t) => (Number.isFinite(by.get(t)) ? by.get(t) * 1000 : null));
     });
     this.latency.set(streams.length ? streams : ["no stream yet"], streams.length ? [times, ...columns] : [[0, 1], [null, null]]);
   }
@@ -361,7 +361,7 @@ class Dock {
   paintTable(host, values, empty) {
     const list = Object.entries(values);
     if (!list.length) return fill(host, h("p", { class: "empty" }, empty));
-    return fill(host, h("table", {}, h("tbody", {}, list.map(([name, value]) => h("tr", {}, h("th", { scope: "row" }, name), h("td", {}, typeof value === "string" ? value : JSON.stringify(value)))))));
+    return fill(host, h("table", {}, h("tbody", {}, list.map(([name, value]) => h("tr", {}, h("th", { scope: "row" }, name), h("td", {}, typeof value === "string" ? value : value === null ? "–" : JSON.stringify(value)))))));
   }
 
   paintEvents(state) {

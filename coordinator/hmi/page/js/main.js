@@ -11,8 +11,11 @@ import { Banner, Operator } from "./operator.js";
 import { toast } from "./toast.js";
 
 const TICK_MS = 100;
+const PATIENCE_MS = 2000; // a page that has just been opened may still be on its way
 const LOST = "Connection to the coordinator lost. What you see is old. Trying again …";
+const NEVER = "No connection to the coordinator yet: nothing here says how it is. Trying again …";
 const ENDED = "This coordinator has ended in good order; its nodes and emergency stop are no longer reached from here. What you see is how it ended.";
+const REFUSED = "The coordinator was started again and has a new key, so it refuses this page. What you see is old. Open the address that it printed when it started, in this browser or here:";
 
 class App {
   constructor(root) {
@@ -20,13 +23,13 @@ class App {
     this.operator = new Operator(this.link);
     this.banner = new Banner();
     this.tabs = { Live: new Live(this.link, this.operator), Design: new Designer(this.link, this.operator), History: new History(this.link, this.operator) };
-    this.lostNote = h("div", { class: "lost", role: "alert", hidden: true }, icon("link"), h("span", {}, LOST));
+    this.lost = new LostBar(this.link);
     this.switch = h("nav", { class: "switch", role: "tablist", "aria-label": "Views" }, Object.keys(this.tabs).map((name) => h("button", { type: "button", role: "tab", onclick: () => this.show(name) }, name)));
     this.theme = h("button", { type: "button", class: "tool", onclick: () => this.setTheme(this.dark ? "light" : "dark") });
     this.wall = h("button", { type: "button", class: "tool", "aria-label": "Wall screen: larger type", title: "Wall screen: larger type", "aria-pressed": "false", onclick: () => this.setWall(!this.isWall) }, icon("wall"));
     this.header = h("header", { class: "top" }, h("span", { class: "brand" }, mark(), "petrobot"), this.switch, this.banner.root, h("div", { class: "spacer" }), this.wall, this.theme, this.operator.estop);
     this.stage = h("main", { class: "main" }, Object.values(this.tabs).map((tab) => tab.root));
-    root.append(this.header, this.lostNote, this.operator.bar, this.stage);
+    root.replaceChildren(this.header, this.lost.root, this.operator.bar, this.stage);
     this.setTheme(localStorage.getItem("petrobot.theme") ?? (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light"));
     this.setWall(localStorage.getItem("petrobot.wall") === "yes");
     this.show(location.hash.slice(1) in this.tabs ? location.hash.slice(1) : "Live");
@@ -69,12 +72,8 @@ class App {
   }
 
   paint(changed, changes) {
-    const { state, connected } = this.link;
-    this.lostNote.hidden = connected || !this.everConnected;
-    this.everConnected ||= connected;
-    text(this.lostNote.lastChild, this.link.goodbye ? ENDED : LOST);
-    attribute(this.lostNote, "data-ended", this.link.goodbye ? "" : null);
-    attribute(document.documentElement, "data-connected", connected ? "yes" : this.link.goodbye ? "ended" : "no");
+    const { state } = this.link;
+    this.lost.update(); // before all that may fail
     this.banner.update(state, this.link.now());
     this.operator.update(state);
     this.tabs.Live.paint(changed, changes);
@@ -86,9 +85,50 @@ class App {
   }
 
   tick() {
+    this.lost.update();
     const now = this.link.now();
     text(this.banner.time, `${now.toFixed(1)} s`);
     if (this.shown === "Live") this.tabs.Live.tick(now);
+  }
+}
+
+/** The bar that says that what is shown is old, why, and what to do about it. */
+class LostBar {
+  constructor(link) {
+    this.link = link;
+    this.text = h("span");
+    this.key = h("input", { type: "text", "aria-label": "Printed address", placeholder: "http://…/?token=…", autocomplete: "off", spellcheck: "false" });
+    this.form = h("form", { class: "row", hidden: true, onsubmit: (event) => this.enter(event) }, this.key, h("button", { type: "submit", class: "small" }, "Open"), h("a", { href: "/" }, "or load this page again"));
+    this.root = h("div", { class: "lost", role: "alert", hidden: true }, icon("link"), this.text, this.form);
+  }
+
+  /** What keeps this page from showing what is so now; empty when nothing does. */
+  get reason() {
+    const { connected, everConnected, fault, goodbye, refused, tries } = this.link;
+    if (fault) return `This page could not show what the coordinator sent (${fault}). What you see is old. Connecting again …`;
+    if (connected) return "";
+    if (refused) return REFUSED;
+    if (goodbye) return ENDED;
+    if (everConnected) return LOST;
+    return tries || performance.now() > PATIENCE_MS ? NEVER : "";
+  }
+
+  update() {
+    const { reason } = this;
+    const { connected, goodbye, refused } = this.link;
+    const calm = goodbye && !refused;
+    this.root.hidden = !reason;
+    text(this.text, reason);
+    this.form.hidden = !refused;
+    attribute(this.root, "data-ended", calm ? "" : null);
+    attribute(document.documentElement, "data-connected", connected ? "yes" : calm ? "ended" : "no");
+  }
+
+  enter(event) {
+    event.preventDefault();
+    const typed = this.key.value.trim();
+    const token = /[?&]token=([^&#\s]+)/.exec(typed)?.[1] ?? encodeURIComponent(typed);
+    if (token) location.assign(`/?token=${token}`);
   }
 }
 
@@ -97,5 +137,9 @@ function mark() {
   node.classList.add("mark");
   return node;
 }
+
+/** A fault of the page's own, anywhere: it must not go unseen. Notices of the browser come without an error. */
+addEventListener("error", (event) => event.error && toast("error", `This page has a fault: ${event.error.message ?? event.error}. Load it again.`));
+addEventListener("unhandledrejection", (event) => toast("error", `This page has a fault: ${event.reason?.message ?? event.reason}. Load it again.`));
 
 window.petrobot = new App(document.getElementById("app"));

@@ -1,7 +1,7 @@
 // The operator's controls: mission commands, who holds the controls, and the emergency stop that is always there.
 
 import { attribute, fill, h, Press, seconds, text, words } from "./dom.js";
-import { listTasks, startForm } from "./files.js";
+import { listTasks, startForm, stopPastTheLink } from "./files.js";
 import { icon } from "./icons.js";
 import { clearDialog, startDialog } from "./start.js";
 import { toast } from "./toast.js";
@@ -67,11 +67,9 @@ export class Operator {
   async stopNow() {
     this.estop.classList.add("given");
     setTimeout(() => this.estop.classList.remove("given"), 1500);
-    if (!this.link.connected) {
-      toast("error", "No connection to the coordinator: use the hardware's emergency stop.");
-      return;
-    }
-    await this.give("estop", {});
+    if (this.link.connected) await this.give("estop", {});
+    else if (await stopPastTheLink()) toast("ok", `${DONE.estop}; this page does not see what it did`);
+    else toast("error", "No connection to the coordinator: use the hardware's emergency stop.");
   }
 
   /** Ask how the run is to go before it is started. */

@@ -33,7 +33,7 @@ export class Selectors {
     alternatives.forEach(({ probability }, i) => {
       const [, meter, share] = row.querySelector(".bars").children[i].children;
       meter.value = probability ?? 0;
-      text(share, probability !== undefined ? `${Math.round(probability * 100)} %` : "");
+      text(share, Number.isFinite(probability) ? `${Math.round(probability * 100)} %` : "");
     });
   }
 

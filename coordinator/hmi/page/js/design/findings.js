@@ -37,8 +37,9 @@ export class Findings {
   async check() {
     const { model } = this.designer;
     const checked = model.data;
+    const asked = (this.asked = (this.asked ?? 0) + 1);
     const said = await checkDocument(model.name, checked, model.renames);
-    if (checked !== model.data) return;
+    if (checked !== model.data || asked !== this.asked) return; // a later question is on its way
     if (!said) {
       attribute(this.root, "aria-busy", null);
       return;

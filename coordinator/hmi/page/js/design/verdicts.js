@@ -50,6 +50,10 @@ export class Verdicts {
     const answer = await analyseDocument(model.name, document, model.renames);
     if (this.asked !== document) return; // it was edited meanwhile
     this.asked = null;
+    if (answer === null) {
+      this.head.textContent = ""; // the check that took its place asks again
+      return;
+    }
     if (typeof answer === "string") {
       this.head.textContent = answer;
       return;

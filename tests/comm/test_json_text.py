@@ -1,0 +1,99 @@
+"""JSON for other readers: no value makes a text that a strict reader refuses, and nothing else writes such texts."""
+
+from __future__ import annotations
+
+import ast
+import json
+from fractions import Fraction
+from math import inf, nan
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.comm.json_text import finite, json_text
+
+ROOT = Path(__file__).parents[2]
+BETWEEN_OWN_PROCESSES = {
+    "coordinator/campaign/cluster.py",
+    "coordinator/campaign/pool.py",
+    "coordinator/campaign/worker.py",
+    "coordinator/experience/estimates_tables.py",
+    "coordinator/learning/joining.py",
+}
+"""Only Python reads these, which knows infinity."""
+FOR_A_HASH = {
+    "coordinator/campaign/plan.py",
+    "coordinator/forecast/registered.py",
+    "services/comm/directory_file.py",
+}
+WRITER = "services/comm/json_text.py"
+
+
+def strict(text: str) -> Any:
+    """What a browser reads; fails where a browser does."""
+
+    def refuse(token: str) -> None:
+        raise AssertionError(f"no JSON: {token}")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+LEAVES = st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.binary(max_size=3)
+VALUES = st.recursive(LEAVES, lambda inner: st.lists(inner) | st.dictionaries(st.text() | st.integers(), inner))
+
+
+@given(VALUES)
+def test_every_value_is_read_by_a_strict_reader(value: Any) -> None:
+    strict(json_text(value))
+    strict(json_text(value, indent=2, ensure_ascii=False))
+
+
+@given(st.recursive(st.integers(-9, 9) | st.floats(allow_nan=False, allow_infinity=False), st.lists))
+def test_finite_values_are_written_as_ever(value: Any) -> None:
+    assert json_text(value) == json.dumps(value)
+    assert finite(value) == value
+
+
+BAD = {"inf": inf, "-inf": -inf, "nan": nan, "float64": np.float64(inf), "float32": np.float32(nan), "long": 10**5000}
+
+
+@pytest.mark.parametrize("bad", BAD.values(), ids=BAD)
+def test_what_is_not_finite_is_no_value_at_any_depth(bad: Any) -> None:
+    told = strict(json_text({"a": [1.5, {"b": (bad, "x")}], "c": bad}))
+    assert told == {"a": [1.5, {"b": [None, "x"]}], "c": None}
+
+
+def test_strange_values_become_text_or_numbers() -> None:
+    ring: dict[str, Any] = {}
+    ring["self"] = ring
+
+    class Mute:
+        def __str__(self) -> str:
+            raise RuntimeError
+
+    told = strict(json_text([np.float32(0.5), Fraction(1, 4), {1}, Mute(), {(1, 2): nan}, ring]))
+    assert told[:4] == [0.5, 0.25, "{1}", "<Mute>"]
+    assert told[4] == {"(1, 2)": None}
+    deep: Any = nan
+    for _ in range(5000):
+        deep = [deep]
+    strict(json_text(deep))
+
+
+def test_nothing_else_writes_json() -> None:
+    """A `json.dumps` of its own somewhere is the next text with `Infinity` in it."""
+    own = BETWEEN_OWN_PROCESSES | FOR_A_HASH | {WRITER}
+    for top in ("coordinator", "services", "sim"):
+        for path in sorted((ROOT / top).rglob("*.py")):
+            calls = [
+                node.lineno
+                for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+                if isinstance(node, ast.Attribute) and node.attr in ("dumps", "dump", "json_response")
+                if isinstance(node.value, ast.Name) and node.value.id in ("json", "web")
+            ]
+            name = path.relative_to(ROOT).as_posix()
+            assert not calls or name in own, f"{name}:{calls[0]}: write JSON with services.comm.json_text.json_text"
