@@ -125,8 +125,9 @@ class Child:
     def describe(self) -> str:
         """How it ended, for people."""
         code = self.process.poll()
-        if self._killed or code is None:
+        if code is None or (self._killed and code == -signal.SIGKILL):
             return self._killed or "it closed its pipe"
+        # Else it had ended by itself before the order to kill it came.
         if code >= 0:
             return f"it exited with code {code}"
         name = signal.Signals(-code).name if -code in set(signal.Signals) else str(-code)
