@@ -48,7 +48,7 @@ def test_the_kernel_ends_one_that_takes_too_much_processor_time() -> None:
         "analysing.main()\n"
     )
     ended = subprocess.run(
-        [sys.executable, "-c", spinning, "drawn.toml"], input=b"", capture_output=True, check=False, timeout=600.0
+        [sys.executable, "-c", spinning, "drawn.toml"], input=b"", capture_output=True, check=False, timeout=240.0
     )
     assert ended.returncode == -signal.SIGKILL
     assert ended.stdout == b'{"said": 1}\n', "what was known before is told"
