@@ -3,12 +3,14 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 RUNS ?= 4
+ROUNDS ?= 20
 
-.PHONY: help demo test proof lint bench clean
+.PHONY: help demo test load proof lint bench clean
 
 help:
 	@echo "make demo   set up, start the cell's nodes, catch $(RUNS) balls in real time, leave a report"
 	@echo "make test   set up, check style and types, run the tests (under 10 minutes)"
+	@echo "make load   repeat the tests that start processes $(ROUNDS) times while every core is busy (hours)"
 	@echo "make proof  check every promised figure in full (hours; resumes where it stopped)"
 	@echo "make bench  measure speed beside others, as ratios"
 	@echo "make clean  remove the environment and all that was made"
@@ -30,6 +32,9 @@ lint: $(VENV)/.ready
 
 test: lint
 	$(BIN)/pytest -n 2 -rs -m "not proof"
+
+load: $(VENV)/.ready
+	$(BIN)/python -m tests.bench.under_load $(ROUNDS)
 
 proof: $(VENV)/.ready
 	$(BIN)/python -m tests.proof

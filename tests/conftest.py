@@ -1,6 +1,10 @@
-"""Settings of all tests: property tests judge results, never wall-clock time; no test hangs for ever."""
+"""Settings of all tests: property tests judge results, never wall-clock time; no test hangs; who starts processes says so."""
 
 from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -11,9 +15,36 @@ settings.load_profile("petrobot")
 PROOF_LIMIT_S = 6 * 3600.0
 """The limit of one test marked `proof` (s); the others have `timeout` of pyproject.toml."""
 
+_started: list[str] = []
+"""What this test has started as processes."""
+
+
+def _note_start(event: str, arguments: tuple[Any, ...]) -> None:
+    if event in ("subprocess.Popen", "os.fork", "os.posix_spawn"):
+        _started.append(f"{event}{arguments[:2]}")
+
+
+sys.addaudithook(_note_start)
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Give each long test the limit of the long ones, unless it has a limit of its own."""
+    """Give each long test the limit of the long ones, unless it has a limit of its own; a browser is a process, too."""
     for item in items:
+        if isinstance(item, pytest.Function) and "browser" in item.fixturenames:
+            item.add_marker("processes")
         if item.get_closest_marker("proof") and not item.get_closest_marker("timeout"):
             item.add_marker(pytest.mark.timeout(PROOF_LIMIT_S))
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_protocol() -> Iterator[None]:
+    """Each test counts its own processes, those of its fixtures among them."""
+    _started.clear()
+    return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item: pytest.Item) -> Iterator[None]:
+    """A test that starts processes is marked so: those are repeated on a busy machine."""
+    yield
+    assert not _started or item.get_closest_marker("processes"), f"mark it `processes`: it starts {_started[0]}"

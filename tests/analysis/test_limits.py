@@ -20,6 +20,8 @@ from coordinator.net import Net
 from tests.analysis.generators import kanban, philosophers
 from tests.waiting import Limit
 
+pytestmark = pytest.mark.processes
+
 ROOM = 3 << 30
 """Bytes of address space that a command gets; libraries alone map about one gigabyte."""
 

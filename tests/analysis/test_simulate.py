@@ -167,3 +167,22 @@ def test_the_compiled_engine_is_an_extra() -> None:
     assert seen.throughput["serve"].covers(0.7289444010755486) and seen.complete
     with pytest.raises(ValueError, match="for a goal"):
         simulate(gspn, sure(10), goal=lambda tokens: tokens[0] > 1, horizon=1.0, engine="numba")
+
+
+@pytest.mark.parametrize("kernel", [False, True], ids=["side by side", "one after the other"])
+def test_an_inhibitor_holds_arrivals_back(kernel: bool) -> None:
+    """A queue that takes nobody in beyond two, as fast out as in: 0, 1 and 2 are equally likely, so the mean is 1."""
+    net = Net.build(
+        {"source": 1, "waiting": 0},
+        {"arrives": ({"source": 1}, {"source": 1, "waiting": 1}), "leaves": ({"waiting": 1}, {})},
+        inhibitors={"arrives": {"waiting": 2}},
+    )
+    gspn = Gspn.of(net, {"arrives": 1.0, "leaves": 1.0})
+    if not kernel:
+        seen = simulate(gspn, sure(7), replicas=200, horizon=220.0, warmup=20.0, confidence=0.9999)
+        assert seen.mean_tokens["waiting"].covers(1.0) and seen.mean_tokens["waiting"].high < 1.2
+        return
+    fires, area = np.zeros(2), np.zeros(2)
+    initial = np.array(net.initial, dtype=np.int64)
+    fired, seconds = play(initial, Tables.of(gspn), sure(7), 3020.0, 20.0, 1_000_000, fires, area)
+    assert fired > 1000 and area[1] / seconds == pytest.approx(1.0, abs=0.15)

@@ -261,6 +261,7 @@ def test_bad_input(
 # --- progress ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.processes
 def test_two_at_once_do_not_write_one_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The second is told who is at it, and touches nothing; a lock whose holder is gone stands in nobody's way."""
     folder = tmp_path / "one"

@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 
 from tests.chaos.shuttle_cell import ROOT
-from tests.chaos.storm import LEAST_EVENTS, LEAST_MISSIONS
+from tests.chaos.storm import LEAST_EVENTS, LEAST_MISSIONS, LONGEST
 
-pytestmark = pytest.mark.processes
+pytestmark = [pytest.mark.processes, pytest.mark.timeout(1500)]
 SHORT, LONG = 20.0, 600.0
 NAMESPACE = ("unshare", "--user", "--map-root-user", "--net")
 
@@ -23,7 +23,7 @@ def storm(folder: Path, seed: int, seconds: float, *, lo: bool = False) -> dict[
     """What a storm tells (tests/chaos/storm.py), in a network namespace of its own if the loopback is to be taken down."""
     command = [sys.executable, "-m", "tests.chaos.storm", str(seed), str(seconds), str(folder)]
     command = [*NAMESPACE, *command, "--lo"] if lo else command
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=seconds + 3 * LONGEST)
     assert done.returncode == 0, done.stdout + done.stderr
     told: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     print(told)

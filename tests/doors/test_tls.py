@@ -23,6 +23,8 @@ from services.comm.security import KeyFileError
 from tests.doors.conftest import HELLO, Victim
 from tests.waiting import beat
 
+pytestmark = pytest.mark.processes
+
 ROOT = Path(__file__).parents[2]
 Start = Callable[..., Victim]
 

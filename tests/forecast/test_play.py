@@ -358,3 +358,76 @@ out = ["end"]
     throws = [Throw(1, 0.0, runs=[entry("a", 1.0, taken="done"), entry("b", 2.0, taken="first")])]
     played = play(text.replace("{threshold}", threshold), throws, n=20)
     assert played.time.tolist() == [seconds] * 20
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "late"),
+    [("weight = 3.0", "weight = 1.0", 0.25), ("priority = 1", "", 0.0), ("", "priority = 1", 1.0)],
+)
+def test_priority_decides_between_two_that_can_fire_then_weight(left: str, right: str, late: float) -> None:
+    """The left way ends at once, the right one a second later."""
+    text = """
+[places.fork]
+kind = "control"
+[places.detour]
+kind = "control"
+[transitions.begin]
+in = ["jobs"]
+out = ["a"]
+[transitions.done]
+in = ["a:normal"]
+out = ["fork"]
+[transitions.left]
+in = ["fork"]
+out = ["end"]
+{left}
+[transitions.right]
+in = ["fork"]
+out = ["detour"]
+{right}
+[transitions.back]
+in = ["detour"]
+out = ["end"]
+after = 1.0
+[transitions.a_lost]
+in = ["a:error"]
+out = ["end"]
+[transitions.b_done]
+in = ["b:normal"]
+out = ["end"]
+[transitions.b_lost]
+in = ["b:error"]
+out = ["end"]
+"""
+    throws = [Throw(1, 0.0, runs=[entry("a", 1.0, taken="done")])]
+    played = play(text.replace("{left}", left).replace("{right}", right), throws)
+    assert set(played.time.tolist()) <= {1.0, 2.0}
+    assert np.mean(played.time == 2.0) == pytest.approx(late, abs=0.04)
+
+
+def test_an_arc_of_weight_two_waits_for_both_tokens() -> None:
+    """a ends after 1 s and b after 2 s; each leaves one token, and the end takes two."""
+    text = """
+[places.parts]
+kind = "control"
+[transitions.begin]
+in = ["jobs"]
+out = ["a", "b"]
+[transitions.a_done]
+in = ["a:normal"]
+out = ["parts"]
+[transitions.b_done]
+in = ["b:normal"]
+out = ["parts"]
+[transitions.both]
+in = ["parts*2"]
+out = ["end"]
+[transitions.a_lost]
+in = ["a:error"]
+out = ["end"]
+[transitions.b_lost]
+in = ["b:error"]
+out = ["end"]
+"""
+    throws = [Throw(1, 0.0, runs=[entry("a", 1.0, taken="a_done"), entry("b", 2.0, taken="b_done")])]
+    assert play(text, throws, n=20).time.tolist() == [2.0] * 20

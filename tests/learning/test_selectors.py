@@ -11,10 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coordinator.cli.learning import SELECTORS
-from coordinator.learning.batch import SUMS, Trial, drawn, restricted
+from coordinator.learning.batch import SUMS, Batch, Trial, drawn, restricted
 from coordinator.learning.estimate import Observation, Tally
 from coordinator.learning.objective import Question
 from coordinator.learning.selectors import RULES, RuleSelector, make
+from coordinator.learning.target import eligible
 from coordinator.task import Executed, Status
 from tests.waiting import Limit
 
@@ -327,6 +328,16 @@ def test_only_actions_that_meet_the_target_are_sought() -> None:
         return max(selector.learned("").items(), key=lambda item: item[1])[0]
 
     assert [learned(t) for t in (None, 0.9, 0.999999)] == ["cheap", "sure", "cheap"]
+
+
+@pytest.mark.parametrize(
+    ("met", "before", "now"), [(100, False, True), (95, False, False), (95, True, True), (89, True, False)]
+)
+def test_an_action_comes_in_surely_and_goes_out_late(met: int, before: bool, now: bool) -> None:
+    """Target 0.9 and 100 runs: in when Wilson's lower bound reaches it (0.96 for 100, 0.89 for 95), out when R itself is below."""
+    batch = Batch.fresh(1, 1, None)
+    batch.runs[:], batch.successes[:] = 100.0, met
+    assert eligible(batch, 0.9, np.array([[before]])).tolist() == [[now]]
 
 
 def test_sums_are_taken_over_from_estimates() -> None:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import signal
+import stat
 import struct
 import subprocess
 import sys
 import tempfile
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import msgpack
@@ -125,6 +127,41 @@ def test_a_journal_has_one_writer_at_a_time(tmp_path: Path) -> None:
     assert len(read_journal(path).records) == 0, "it may be read all the time"
     first.close()
     JournalWriter(path).close()
+
+
+def test_a_missing_record_is_refused(tmp_path: Path) -> None:
+    """Every record is whole, but one has gone: what follows it would be derived from a marking that never was."""
+    path = written(tmp_path, [("one", {}), ("two", {}), ("three", {})])
+    raw, header = path.read_bytes(), len(written(tmp_path / "empty", []).read_bytes())
+    first = header + 8 + struct.unpack_from("<I", raw, header)[0]
+    path.write_bytes(raw[:header] + raw[first:])
+    with pytest.raises(JournalError, match="record 1 is numbered 2; a part is missing"):
+        read_journal(path)
+
+
+def test_what_is_synced_has_been_handed_to_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The system is asked to make it durable each time, and the folder once, so that the file's name survives as well."""
+    asked: list[tuple[bool, int]] = []
+
+    def noted(real: Callable[[int], None]) -> Callable[[int], None]:
+        def sync(handle: int) -> None:
+            asked.append((stat.S_ISDIR(os.fstat(handle).st_mode), os.fstat(handle).st_size))
+            real(handle)
+
+        return sync
+
+    for name in ("fsync", "fdatasync"):
+        monkeypatch.setattr(os, name, noted(getattr(os, name)))
+    writer = JournalWriter(tmp_path / "run.journal", {"task": "t"})
+    sizes = [(tmp_path / "run.journal").stat().st_size]
+    for number in range(2):
+        writer.append("k", {"n": number})
+        writer.sync()
+        writer.sync()  # nothing new: nothing is asked
+        sizes.append((tmp_path / "run.journal").stat().st_size)
+    writer.close()
+    assert [size for folder, size in asked if not folder] == sizes and len(set(sizes)) == 3
+    assert [folder for folder, _ in asked].count(True) == 1
 
 
 def test_a_place_where_no_journal_can_be_is_refused(tmp_path: Path) -> None:

@@ -195,6 +195,7 @@ def test_numbers_are_packed_for_compiled_kernels_alone() -> None:
         assert isinstance(array, np.ndarray) and array.tolist() == [1.0, 2.5]
 
 
+@pytest.mark.processes
 def test_numba_can_be_left_out() -> None:
     """The switch in the environment: kernels run as they stand, whether numba is installed or not."""
     code = "import sys; import sim.arm_motion as m; print(type(m.stepped).__name__, 'numba' in sys.modules)"

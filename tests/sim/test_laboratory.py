@@ -272,6 +272,7 @@ def test_a_preparation_that_cannot_be_is_refused(bench: Benches, arguments: dict
 # Determinism
 
 
+@pytest.mark.processes
 def test_the_same_seed_gives_the_same_bits_here_and_in_a_fresh_process(digests: Digests) -> None:
     """Frames, pixels and score; also when the laboratory had been prepared for another run before."""
     here = digests(3, "B+drift")
