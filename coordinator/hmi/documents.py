@@ -14,6 +14,7 @@ from aiohttp import web
 from coordinator.analysing import RefusedError
 from coordinator.hmi.house import HOUSE, House
 from coordinator.hmi.requests import json_answer, read_object, refused, send_json
+from coordinator.hmi.store import StoreError
 
 RENAMES_AT_MOST = 1000
 DESK_AT_MOST = 64
@@ -24,6 +25,7 @@ def add_routes(app: web.Application) -> None:
     app.router.add_get("/api/tasks", _list)
     app.router.add_get("/api/tasks/{name}", _open)
     app.router.add_put("/api/tasks/{name}", _save)
+    app.router.add_get("/api/revisions/{name}", _revision)
     app.router.add_post("/api/check", _check)
     app.router.add_post("/api/analyse", _analyse)
     app.router.add_get("/api/tasks/{name}/export/{form}", _export)
@@ -41,6 +43,14 @@ async def _open(request: web.Request) -> web.StreamResponse:
     house = request.app[HOUSE]
     given = {**house.store.folders, "name": request.match_info["name"], "where": _where(house)}
     return await _done(request, "opening", given)
+
+
+async def _revision(request: web.Request) -> web.Response:
+    """{revision}: whether a file is still the one that was opened; cheap enough to be asked every few seconds."""
+    try:
+        return json_answer({"revision": request.app[HOUSE].store.read(request.match_info["name"]).revision})
+    except StoreError as fault:
+        raise refused(RefusedError(fault.status, str(fault))) from fault
 
 
 async def _save(request: web.Request) -> web.StreamResponse:

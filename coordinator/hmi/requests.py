@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -42,10 +43,11 @@ async def send_json(request: web.Request, text: bytes, status: int = 200) -> web
     headers = {**HEADERS, "Cache-Control": "no-store", "Content-Type": "application/json; charset=utf-8"}
     response = web.StreamResponse(status=status, headers=headers)
     response.content_length = len(text)
-    await response.prepare(request)
-    for begin in range(0, len(text), PIECE):
-        await response.write(text[begin : begin + PIECE])
-    await response.write_eof()
+    with contextlib.suppress(ConnectionError):  # whoever asked has left meanwhile
+        await response.prepare(request)
+        for begin in range(0, len(text), PIECE):
+            await response.write(text[begin : begin + PIECE])
+        await response.write_eof()
     return response
 
 

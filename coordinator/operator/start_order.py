@@ -37,7 +37,7 @@ SUFFIX: Final = ".db"
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,63}")
 _KINDS: Final = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
 _SHORT: Final = reprlib.Repr()
-_KNOWN: Final = frozenset({"task", "mode", "runs", "seed", "regime", "parameters", "learn", "pace", "from"})
+_KNOWN: Final = frozenset({"task", "mode", "runs", "seed", "regime", "parameters", "learn", "pace", "from", "revision"})
 
 
 @dataclass(frozen=True)

@@ -71,7 +71,7 @@ class Station:
         self.door: Callable[[str], Door] | None = None
         self._tasks = tasks
         self._starting_by = Starting(directory, runs, mock, estimates)
-        self._loaded = ""
+        self._loaded = self._revision = ""
         self._stops: set[str] = set()
         self._choices: dict[str, str] = {}
         self._nodes: Mapping[str, Any] = {}
@@ -166,10 +166,18 @@ class Station:
             return refusal("task", str(fault))
         if (busy := self._busy()) is not None:  # a run was started meanwhile
             return busy
-        self._forget(text.name)
-        self._narrator(task).begin("", "realtime", **self._kept(task))
-        self.feed.emit("mission", mission={"file": text.name})
+        self._show(text, task)
         return {"ok": True}
+
+    def _show(self, text: TaskText, task: Task) -> None:
+        if text.name != self._loaded:
+            self._forget(text.name)
+        self._revision = text.revision
+        self._narrator(task).begin("", "realtime", **self._kept(task))
+        self._tell_file()
+
+    def _tell_file(self) -> None:
+        self.feed.emit("mission", mission={"file": self._loaded, "revision": self._revision})
 
     async def _start(self, who: str, data: Mapping[str, Any]) -> Answer:
         if self._going is not None and self.feed.state["mission"]["state"] in OVER:
@@ -201,10 +209,17 @@ class Station:
             task = await asyncio.to_thread(_prepared, text)
         except (StoreError, TaskFileError) as fault:
             return refusal("faults", str(fault))
+        seen = data.get("revision") or ("" if data.get("task") else self._revision)
+        if seen not in ("", text.revision):
+            self._show(text, task)
+            return refusal(
+                "changed", f"{name} was changed outside since it was shown; now it is shown as it is: start it again"
+            )
         if (faulty := await self._faults(text)) is not None:
             return faulty
         if name != self._loaded:
             self._forget(name)
+        self._revision = text.revision
         order = read_start(task, data, self._starting_by.estimates)
         if order.mode == LOCKSTEP:
             return self._simulated(await asyncio.to_thread(self._starting_by.simulated, task, text.text, order))
@@ -220,7 +235,7 @@ class Station:
 
     def _simulated(self, run: SimulatedRun) -> Answer:
         run.lead(self.feed, self.controls, self.door, self._stops, self._choices)
-        self.feed.emit("mission", mission={"file": self._loaded})
+        self._tell_file()
         self._follow(run)
         return {"ok": True, "run": run.identity}
 
@@ -244,7 +259,7 @@ class Station:
             run.discard()
             return {**refusal("unreachable", str(fault)), "nodes": list(fault.nodes)}
         run.lead(self.feed, self.controls, self.door, self._stops, self._choices)
-        self.feed.emit("mission", mission={"file": self._loaded})
+        self._tell_file()
         self._follow(run)
         return {"ok": True, "run": run.identity}
 
@@ -275,7 +290,7 @@ class Station:
     # --- what may be said while idle ---------------------------------------------------------------------------------
 
     def _forget(self, name: str) -> None:
-        self._loaded = name
+        self._loaded, self._revision = name, ""
         self._stops, self._choices = set(), {}
 
     async def _breakpoint(self, who: str, data: Mapping[str, Any]) -> Answer:

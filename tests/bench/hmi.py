@@ -7,12 +7,19 @@ real feed and server. Measured: in headless Chromium the main thread's time for 
 `TaskDuration`), frames a second, gaps in the sequence, and the time from the change in the server to the painted frame; in
 the loop its own CPU time and how late its 50 Hz ticker came, without a client and with five in another process, one of
 which reads next to nothing. `--gate-cpu` makes the run fail when a painted update costs more, or when there was a gap.
+
+    python tests/bench/hmi.py --checks 300 [--rounds 3] [--seconds 8] [--json FILE]
+
+A real mission in real time over two nodes fires as fast as its actions of 10 ms allow, while an asker in another process gives
+commands and, in every second turn, a third process draws: three checks of a net of so many places at a time, without a pause.
+Told are firings a second and the commands' latency with and without the drawing, and the ratios of their medians.
 """
 
 from __future__ import annotations
 
 import argparse
 import asyncio
+import itertools
 import json
 import statistics
 import subprocess
@@ -31,6 +38,7 @@ sys.path.insert(0, str(ROOT))
 from coordinator.hmi.feed import Feed  # noqa: E402 - the bench runs as a file
 from coordinator.hmi.server import Page, start_page  # noqa: E402
 from tests.hmi.conftest import ARGUMENTS, BROWSER  # noqa: E402
+from tests.station.conftest import SCRIPT, TASK, Cell  # noqa: E402
 
 RATE = 50
 PROBE = """() => {
@@ -209,6 +217,119 @@ async def with_crowd(page: Page, measure: Callable[[], Awaitable[dict[str, float
         await process.wait()
 
 
+# --- a mission beside somebody who draws ----------------------------------------------------------------------------------
+
+
+def drawing(places: int) -> dict[str, Any]:
+    """A document of a chain of action places with an error exit each."""
+    document: dict[str, Any] = {
+        "schema": 1,
+        "task": {"name": "drawn", "final": "done > 0"},
+        "primitive_tasks": {"look": {"goal": "seen", "alternatives": ["look_at_table"], "deadline": 5.0}},
+        "places": {"done": {"kind": "control"}},
+        "transitions": {},
+    }
+    for i in range(places):
+        then = f"p{i + 1}" if i + 1 < places else "done"
+        document["places"][f"p{i}"] = {"kind": "action", "task": "look"} | ({} if i else {"tokens": 1})
+        document["transitions"][f"t{i}"] = {"in": [f"p{i}:normal"], "out": [then]}
+        document["transitions"][f"e{i}"] = {"in": [f"p{i}:error"], "out": [then]}
+    return document
+
+
+async def draw(url: str, token: str, places: int) -> None:
+    """Check three drawings at a time for ever; runs in a process of its own."""
+    document = drawing(places)
+    async with aiohttp.ClientSession(url, headers={"Authorization": f"Bearer {token}"}) as http:
+
+        async def hand(name: str) -> None:
+            for turn in itertools.count():
+                body = {"name": name, "document": {**document, "task": {**document["task"], "text": f"turn {turn}"}}}
+                async with http.post("/api/check", json=body) as answer:
+                    assert answer.status == 200, await answer.text()
+                print(name, flush=True)
+
+        await asyncio.gather(*(hand(f"drawn_{i}") for i in range(3)))
+
+
+async def give(url: str, token: str, seconds: float) -> None:
+    """Give a command every 50 ms and print how long each took (ms); runs in a process of its own."""
+    late = []
+    async with aiohttp.ClientSession(url, headers={"Authorization": f"Bearer {token}"}) as http:
+        until = time.perf_counter() + seconds
+        while time.perf_counter() < until:
+            begun = time.perf_counter()
+            async with http.post("/api/command", json={"verb": "ask_controls", "name": "asker"}) as answer:
+                assert answer.status == 200, await answer.text()
+            late.append((time.perf_counter() - begun) * 1000)
+            await asyncio.sleep(0.05)
+    print(json.dumps(late))
+
+
+async def beside(page: Page, state: Mapping[str, Any], seconds: float, places: int) -> dict[str, float]:
+    """Firings a second and latencies for so long, with somebody who draws unless `places` is 0."""
+    arguments = [sys.executable, __file__]
+    drawer = None
+    if places:
+        drawer = await asyncio.create_subprocess_exec(
+            *arguments, "--draw", page.base, page.token, str(places), stdout=subprocess.PIPE
+        )
+        assert drawer.stdout is not None
+        await asyncio.wait_for(drawer.stdout.readline(), 300)  # from its first answer on
+    asker = await asyncio.create_subprocess_exec(
+        *arguments, "--give", page.base, page.token, str(seconds), stdout=subprocess.PIPE
+    )
+    begun, firings = time.perf_counter(), mission_of(state)["firings"]
+    said, _ = await asyncio.wait_for(asker.communicate(), seconds + 120)
+    rate = (mission_of(state)["firings"] - firings) / (time.perf_counter() - begun)
+    checks = 0
+    if drawer is not None:
+        drawer.kill()
+        rest, _ = await drawer.communicate()
+        checks = rest.count(b"\n")
+    late = sorted(json.loads(said))
+    worst = {"command_p99_ms": late[int(len(late) * 0.99)], "command_worst_ms": late[-1]}
+    return {"firings_per_s": rate, "command_p50_ms": statistics.median(late), **worst, "checks": checks}
+
+
+def mission_of(state: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Its part of the snapshot, which must say that it runs."""
+    mission: Mapping[str, Any] = state["mission"]
+    assert mission["state"] == "running", mission
+    return mission
+
+
+async def with_checks(places: int, seconds: float, rounds: int) -> dict[str, Any]:
+    """A mission with and without somebody who draws, in turns."""
+    with tempfile.TemporaryDirectory() as folder:
+        cell = Cell(Path(folder), SCRIPT.replace("seconds = 0.05", "seconds = 0.01"))
+        for node in cell.nodes.values():
+            await node.start()
+        text = TASK.replace("tokens = 2\ncapacity = 9", "tokens = 1000000")
+        cell.tasks.save_text("moving", cell.tasks.read("moving").revision, text)
+        await cell.station.look()
+        await cell.say("take_controls")
+        page = await start_page(cell.station, tasks_folder=Path(folder) / "tasks")
+        assert (await cell.say("start", task="moving"))["ok"]
+        await cell.until(lambda: cell.state["mission"]["firings"] > 100)
+        turns: dict[str, list[dict[str, float]]] = {"alone": [], "checks": []}
+        for _ in range(rounds):
+            turns["alone"].append(await beside(page, cell.state, seconds, 0))
+            turns["checks"].append(await beside(page, cell.state, seconds, places))
+        begun = time.perf_counter()
+        await cell.say("estop")
+        stopped = (time.perf_counter() - begun) * 1000
+        await page.close()
+        await cell.station.close()
+        for node in cell.nodes.values():
+            await node.close()
+    medians = {
+        turn: {key: statistics.median(one[key] for one in many) for key in many[0]} for turn, many in turns.items()
+    }
+    ratios = {key: medians["checks"][key] / medians["alone"][key] for key in list(medians["alone"])[:3]}
+    return {"places": places, "medians": medians, "ratios": ratios, "estop_ms": stopped, "turns": turns}
+
+
 async def measured(nodes: int, seconds: float) -> dict[str, Any]:
     """All figures of one size of net."""
     mission = SyntheticMission(nodes)
@@ -234,8 +355,26 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=8.0)
     parser.add_argument("--gate-cpu", type=float, help="fail when a painted update costs more ms, or at a gap")
     parser.add_argument("--json", type=Path)
+    parser.add_argument(
+        "--checks", type=int, metavar="PLACES", help="a mission beside checks of a net of so many places"
+    )
+    parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--crowd", nargs=2, help=argparse.SUPPRESS)
+    parser.add_argument("--draw", nargs=3, help=argparse.SUPPRESS)
+    parser.add_argument("--give", nargs=3, help=argparse.SUPPRESS)
     options = parser.parse_args()
+    if options.draw:
+        asyncio.run(draw(options.draw[0], options.draw[1], int(options.draw[2])))
+        return 0
+    if options.give:
+        asyncio.run(give(options.give[0], options.give[1], float(options.give[2])))
+        return 0
+    if options.checks:
+        text = json.dumps(asyncio.run(with_checks(options.checks, options.seconds, options.rounds)), indent=2)
+        print(text)
+        if options.json:
+            options.json.write_text(text, encoding="utf-8")
+        return 0
     if options.crowd:
         asyncio.run(crowd(*options.crowd))
         return 0

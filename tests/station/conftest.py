@@ -121,13 +121,13 @@ def toy_node(directory: Directory, name: str, script: Mapping[str, Callable[...,
 class Cell:
     """A station, its nodes, and one operator."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, script: str = SCRIPT) -> None:
         path = folder / "services.toml"
         path.write_text(SERVICES.format(*free_ports(2)), encoding="utf-8")
-        (folder / "script.toml").write_text(SCRIPT, encoding="utf-8")
-        script = load(folder / "script.toml")
+        (folder / "script.toml").write_text(script, encoding="utf-8")
+        scripted = load(folder / "script.toml")
         self.directory = parse(path.read_text(encoding="utf-8"), path)
-        self.nodes = {name: toy_node(self.directory, name, script) for name in self.directory.nodes}
+        self.nodes = {name: toy_node(self.directory, name, scripted) for name in self.directory.nodes}
         self.tasks = TaskStore(folder / "tasks")
         self.tasks.save_text("moving", None, TASK)
         self.runs = folder / "runs"

@@ -1,6 +1,6 @@
 // A net view with what stands around it on every tab: zoom, search, error branches, minimap, the path of opened macros.
 
-import { fill, h, keep, text, words } from "./dom.js";
+import { attribute, fill, h, keep, text, words } from "./dom.js";
 import { icon } from "./icons.js";
 import { Minimap } from "./minimap.js";
 import { NetView } from "./net_view.js";
@@ -14,7 +14,7 @@ export class Canvas {
   constructor(label, events = {}) {
     this.drawing = h("div", { class: "drawing" });
     this.path = h("nav", { class: "path", "aria-label": "Opened macro places" });
-    this.errors = h("button", { type: "button", class: "tool wide", "aria-pressed": "false", onclick: () => this.fold(!this.view.folded) }, icon("fold"), "Error branches");
+    this.errors = h("button", { type: "button", class: "tool wide", "aria-pressed": "false", onclick: () => this.fold(!this.view.folded) }, icon("fold"), h("span", {}, "Error branches"));
     this.query = h("input", { type: "search", placeholder: "Find", "aria-label": "Find a place or transition", oninput: () => this.find(), onkeydown: (e) => this.searchKey(e) });
     this.hits = h("ul", { class: "hits", role: "listbox", "aria-label": "Found" });
     this.bar = h("div", { class: "canvas-bar" },
@@ -31,6 +31,15 @@ export class Canvas {
     this.view.show(net);
     this.errors.hidden = ![...this.view.elements.values()].some((e) => e.error);
     this.map.draw(this.view);
+  }
+
+  /** Show where tokens are in error branches; those that nothing on this sheet shows are counted on the button that unfolds. */
+  alarm(found) {
+    this.view.alarm(found);
+    attribute(this.errors, "data-alarm", found.hidden || null);
+    text(this.errors.lastChild, found.hidden ? `Error branches: ${found.hidden}` : "Error branches");
+    attribute(this.errors, "title", found.hidden ? `${found.hidden === 1 ? "1 token is" : `${found.hidden} tokens are`} in error branches that are not shown` : null);
+    if (found.hidden) this.errors.hidden = false;
   }
 
   fold(folded) {

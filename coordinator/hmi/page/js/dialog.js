@@ -25,5 +25,7 @@ export function openDialog(dialog) {
   dialog.setAttribute("aria-modal", "true");
   document.body.append(veil, dialog);
   dialog.show();
-  (dialog.querySelector("input") ?? within().at(-1))?.focus();
+  // Enter without looking must do no harm: of buttons, one that neither destroys nor sends has the focus
+  const harmless = within().find((node) => !node.matches(".danger, [type=submit]"));
+  (dialog.querySelector("input") ?? harmless ?? within()[0])?.focus();
 }

@@ -38,9 +38,20 @@ export function keep(event) {
   if (!event.ctrlKey && !event.metaKey) event.stopPropagation();
 }
 
-/** Replace an element's children. */
+const CONTROLS = "input, textarea, select, button, a[href]";
+const calledOf = (control) => control.getAttribute("aria-label") ?? control.closest("label")?.firstChild?.textContent ?? control.textContent;
+
+/** Replace an element's children. A control that had the focus gives it to the new one of the same name. */
 export function fill(element, ...children) {
+  const at = element.contains(document.activeElement) ? document.activeElement : null;
+  const called = at?.matches(CONTROLS) ? calledOf(at) : null;
+  const alike = () => [...element.querySelectorAll(CONTROLS)].filter((control) => calledOf(control) === called);
+  const turn = called === null ? 0 : alike().indexOf(at);
   element.replaceChildren(...children.flat(3).filter((child) => child !== null && child !== undefined && child !== false));
+  if (called === null || element.contains(document.activeElement)) return element;
+  const control = alike()[turn] ?? alike()[0];
+  control?.focus({ preventScroll: true });
+  control?.select?.(); // as Tab does
   return element;
 }
 

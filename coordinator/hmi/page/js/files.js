@@ -33,6 +33,16 @@ export async function stopPastTheLink() {
   }
 }
 
+/** The revision of a task file as it stands now; null when it is not known. */
+export async function revisionOf(name) {
+  try {
+    const answer = await ask("GET", `/api/revisions/${encodeURIComponent(name)}`);
+    return answer.ok ? answer.value.revision : null;
+  } catch {
+    return null;
+  }
+}
+
 export const listTasks = async () => (await need("GET", "/api/tasks")) ?? [];
 export const openTask = (name) => need("GET", `/api/tasks/${encodeURIComponent(name)}`);
 export const loadOffers = async () => (await need("GET", "/api/offers")) ?? [];

@@ -6,7 +6,7 @@ import { listRuns, openRun } from "./files.js";
 import { icon } from "./icons.js";
 import { reasonText } from "./live.js";
 import { departDialog } from "./start.js";
-import { alarmed, sheetOf, tokensOf, trailOf } from "./sheet.js";
+import { alarms, drawnOn, sheetOf, tokensOf, trailOf } from "./sheet.js";
 
 const SESSION = "(this run)";
 const ROWS_AROUND = 120;
@@ -56,6 +56,7 @@ class Reel {
 class Screen {
   constructor(label) {
     this.canvas = new Canvas(label, { opened: (e) => e.kind === "macro" && this.open(e.name) });
+    this.canvas.folded = () => this.reel && this.show(this.index, false);
     this.inside = "";
     this.tag = h("span", { class: "tag" });
     this.canvas.bar.append(this.tag);
@@ -91,8 +92,11 @@ class Screen {
     const marking = this.reel.marking(this.index);
     const shown = tokensOf(task, marking);
     const { view } = this.canvas;
-    view.alarm(alarmed(task, marking, this.reel.firings.filter((f) => f.index <= this.index).map((f) => f.transition)));
-    if (moving && this.index) for (const firing of this.reel.records[this.index - 1].firings) view.fire(firing.transition, firing.error);
+    const fired = this.reel.firings.filter((f) => f.index <= this.index).map((f) => f.transition);
+    this.canvas.alarm(alarms(task, marking, this.inside, (name) => view.sees(name), fired));
+    const drawn = drawnOn(task, this.inside);
+    const as = (name) => (view.elements.has(name) ? name : drawn(name));
+    if (moving && this.index) for (const firing of this.reel.records[this.index - 1].firings) view.fire(as(firing.transition), firing.error);
     for (const element of view.elements.values()) if (element.shape === "place") view.tokens(element.name, shown[element.name] ?? 0);
   }
 }

@@ -9,7 +9,7 @@ import { stateOf } from "./operator.js";
 import { Learning, objectives } from "./learning.js";
 import { Selected } from "./selected.js";
 import { Selectors } from "./selectors.js";
-import { alarmed, sheetOf, tokensOf, trailOf } from "./sheet.js";
+import { alarms, drawnOn, runsOn, sheetOf, tokensOf, trailOf } from "./sheet.js";
 import { Timeline } from "./timeline.js";
 
 const FIRINGS_SHOWN = 25;
@@ -32,7 +32,7 @@ export class Live {
     this.selectors = new Selectors(link, operator);
     this.result = h("section", { class: "result", role: "status", hidden: true });
     this.side = h("aside", { class: "side", "aria-label": "Mission details" }, this.result, this.selected.root, this.running.root, this.firings.root, this.selectors.root, this.nodes.root);
-    this.dock = new Dock(link, (place) => this.canvas.goTo(place), () => this.paintHeat());
+    this.dock = new Dock(link, (place) => this.goTo(place), () => this.paintHeat());
     this.notice = h("p", { class: "empty-net" }, "No task is loaded.");
     this.canvas.root.append(this.notice);
     this.root = h("div", { class: "live" }, h("div", { class: "stage" }, this.canvas.root, this.dock.root), this.side);
@@ -119,7 +119,7 @@ export class Live {
 
   fired(firing) {
     const name = this.drawnAs(firing.transition);
-    if (name) this.view.fire(name, Boolean(firing.error));
+    if (name) this.view.fire(name, Boolean(firing.error)); // a closed macro place lights up
   }
 
   /** How an element is called on the drawing. */
@@ -132,8 +132,23 @@ export class Live {
     return words(this.labels.get(name) || name);
   }
 
+  /** What stands for an element on the sheet that is open; null when it is outside. */
   drawnAs(name) {
-    return this.view.elements.has(name) ? name : null;
+    const { task } = this.link.state;
+    if (this.view.elements.has(name) || !task) return this.view.elements.has(name) ? name : null;
+    if (this.drawnKey !== `${this.taskKey} ${this.inside}`) {
+      this.drawnKey = `${this.taskKey} ${this.inside}`;
+      this.drawn = drawnOn(task, this.inside);
+    }
+    return this.drawn(name);
+  }
+
+  /** Go to an element, opening the macro place that it is in. */
+  goTo(name) {
+    const { task } = this.link.state;
+    const element = [...(task?.places ?? []), ...(task?.transitions ?? [])].find((e) => e.name === name);
+    if (element && !this.view.elements.has(name)) this.open(element.in_macro ?? "");
+    return this.canvas.goTo(name);
   }
 
   paintTokens() {
@@ -144,10 +159,10 @@ export class Live {
   }
 
   paintRuns() {
-    const { runs } = this.link.state;
-    const byPlace = new Map();
-    for (const run of Object.values(runs)) byPlace.set(run.place, run);
-    for (const element of this.view.elements.values()) if (element.kind === "action") this.view.run(element.name, byPlace.get(element.name));
+    const { runs, task } = this.link.state;
+    if (!task) return;
+    const shown = runsOn(task, runs, this.inside);
+    for (const element of this.view.elements.values()) if (["action", "macro"].includes(element.kind)) this.view.run(element.name, shown.get(element.name));
   }
 
   paintCards() {
@@ -159,7 +174,7 @@ export class Live {
   }
 
   runCard(run) {
-    const node = h("li", { class: "card", onclick: () => this.canvas.goTo(this.drawnAs(run.place)) });
+    const node = h("li", { class: "card", onclick: () => this.goTo(run.place) });
     node.parts = { action: h("strong"), where: h("span", { class: "chip" }), why: h("p", { class: "why" }), bar: h("progress", { max: 1 }), time: h("span", { class: "number" }), state: h("span", { class: "muted" }) };
     const { action, where, why, bar, time, state } = node.parts;
     node.append(h("div", { class: "line" }, action, where), why, bar, h("div", { class: "line" }, state, time));
@@ -194,13 +209,13 @@ export class Live {
     const { breakpoints, firings, marking, task } = this.link.state;
     const stops = new Set(breakpoints.map((b) => b.replace(/^(places|transitions)\./, "")));
     const failed = new Map();
-    for (const firing of firings.slice(-FIRINGS_SHOWN)) if (firing.error) failed.set(firing.transition, firing);
+    for (const firing of firings.slice(-FIRINGS_SHOWN)) if (firing.error) failed.set(this.drawnAs(firing.transition), firing);
     for (const element of this.view.elements.values()) {
       this.view.mark(element.name, "breakpoint", stops.has(element.name) ? "breakpoint" : null, "Breakpoint");
       const why = failed.get(element.name);
-      if (element.shape === "transition") this.view.mark(element.name, "reason", why ? "failed" : null, why ? reasonText(why) : "");
+      if (element.shape === "transition" || element.kind === "macro") this.view.mark(element.name, "reason", why ? "failed" : null, why ? reasonText(why) : "");
     }
-    if (task) this.view.alarm(alarmed(task, marking, firings.map((f) => f.transition)));
+    if (task) this.canvas.alarm(alarms(task, marking, this.inside, (name) => this.view.sees(name), firings.map((f) => f.transition)));
   }
 
   paintFirings(now = true) {
@@ -220,7 +235,7 @@ export class Live {
     const reason = reasonText(firing);
     const what = firing.error ? "error" : firing.reason?.status === "failure" ? "failure" : "plain";
     return h("li", { class: `firing ${what}` },
-      h("button", { type: "button", onclick: () => this.canvas.goTo(firing.transition) },
+      h("button", { type: "button", onclick: () => this.goTo(firing.transition) },
         h("span", { class: "line" }, h("strong", {}, this.labelOf(firing.transition)), h("span", { class: "number" }, seconds(firing.at))),
         h("span", { class: "cause" }, words(firing.cause ?? "")),
         reason ? h("span", { class: "reason" }, icon(firing.error ? "error" : "warning"), h("span", {}, reason)) : null));

@@ -11,6 +11,7 @@ const LABEL_MOST = 24;
 const ZOOM = [0.12, 3];
 const FLASH_MS = 550;
 
+const tokens = (n) => (n === 1 ? "1 token" : `${n} tokens`);
 const short = (label) => (label.length > LABEL_MOST ? `${label.slice(0, LABEL_MOST - 1)}…` : label);
 
 let views = 0;
@@ -96,11 +97,11 @@ export class NetView {
       marks: s("g", { class: "marks" }),
     };
     const node = s("g", { class: `element place ${element.kind}` }, Object.values(parts));
-    const isAction = element.kind === "action";
+    const runs = ["action", "macro"].includes(element.kind);
     element.parts = {
       ...parts,
-      tint: isAction ? s("circle", { class: "tint", r: PLACE_R - 1 }) : "",
-      progress: isAction ? s("circle", { class: "progress", r: PLACE_R + 4, pathLength: 100, transform: "rotate(-90)" }) : "",
+      tint: runs ? s("circle", { class: "tint", r: PLACE_R - 1 }) : "",
+      progress: runs ? s("circle", { class: "progress", r: PLACE_R + 4, pathLength: 100, transform: "rotate(-90)" }) : "",
       tokens: s("g", { class: "tokens" }),
     };
     return this.wire(element, node);
@@ -142,9 +143,10 @@ export class NetView {
 
   name(element) {
     const what = element.shape === "place" ? KIND_WORD[element.kind] : "Transition";
-    const tokens = element.shape === "place" ? `, ${element.tokens} ${element.tokens === 1 ? "token" : "tokens"}` : "";
+    const held = element.shape === "place" ? `, ${tokens(element.tokens)}` : "";
     const more = element.state ? `, ${element.state}` : "";
-    attribute(element.node, "aria-label", `${what} ${element.label || element.name}${tokens}${more}`);
+    const alarm = element.alarm ? `, ${element.alarm} in an error branch` : "";
+    attribute(element.node, "aria-label", `${what} ${element.label || element.name}${held}${more}${alarm}`);
   }
 
   showArcs(arcs) {
@@ -258,12 +260,37 @@ export class NetView {
     for (const element of this.elements.values()) this.mark(element.name, "fold", badges.has(element.name) ? "fold" : null);
   }
 
-  /** Turn the badges of folded error branches red while a token is in one. */
-  alarm(names) {
+  /** Whether an element is drawn here and not folded away. */
+  sees(name) {
+    const element = this.elements.get(name);
+    return Boolean(element) && !this.isFolded(element);
+  }
+
+  /** Say how many tokens are in error branches: at the badges of folded ones, and at macro places that are closed. */
+  alarm({ folded, inside }) {
     for (const element of this.elements.values()) {
+      const [away, within] = [folded.get(element.name) ?? 0, inside.get(element.name) ?? 0];
+      const known = element.marksByKey;
+      if (away && !known?.get("fold")) this.mark(element.name, "fold", "fold");
       const badge = element.marksByKey?.get("fold");
-      if (badge) attribute(badge, "class", `mark fold${names.has(element.name) ? " alarm" : ""}`);
+      if (badge) this.count(badge, away, `mark fold${away ? " alarm" : ""}`, away ? `${tokens(away)} in this error branch, folded: choose to show it` : MARK_HINT.fold);
+      this.mark(element.name, "inside", within ? "error" : null, within ? `${tokens(within)} in an error branch inside` : "");
+      const mark = element.marksByKey?.get("inside");
+      if (mark) this.count(mark, within, "mark error alarm");
+      const alarm = away + within;
+      if ((element.alarm ?? 0) === alarm) continue;
+      element.alarm = alarm;
+      this.name(element);
     }
+  }
+
+  /** A number in the place of a mark's sign. */
+  count(mark, number, style, hint = null) {
+    attribute(mark, "class", style);
+    mark.number ??= mark.appendChild(s("text", { class: "number", y: 4 }));
+    text(mark.number, number || "");
+    attribute(mark.querySelector("path"), "display", number ? "none" : null);
+    if (hint) text(mark.querySelector("title"), hint);
   }
 
   /** Small signs at an element: a breakpoint, a fault, a folded branch. `sign` null takes it away. */
@@ -480,7 +507,7 @@ export class NetView {
 }
 
 const MARK_AT = {
-  place: { fold: [26, 21], fault: [25, -21], breakpoint: [-25, -21], reason: [25, -21] },
+  place: { inside: [-26, 21], fold: [26, 21], fault: [25, -21], breakpoint: [-25, -21], reason: [25, -21] },
   transition: { fold: [14, 20], fault: [14, -24], breakpoint: [-14, -24], reason: [14, -24] },
 };
 const MARK_GLYPH = { fold: "M12 4.5v9M12 17.5v.6", breakpoint: "", failed: "M12 4.5v9M12 17.5v.6" };

@@ -64,6 +64,15 @@ export class Operator {
     return answer;
   }
 
+  /** Take the controls if nobody has them; false, with a word, when somebody else does. */
+  async hold() {
+    if (this.link.mayAct) return true;
+    const { holder } = this.link.state.controls;
+    if (holder === null) return (await this.give("take_controls", {}, true)).ok;
+    toast("error", `${holder} holds the controls: ask for them under Live`);
+    return false;
+  }
+
   async stopNow() {
     this.estop.classList.add("given");
     setTimeout(() => this.estop.classList.remove("given"), 1500);
@@ -75,9 +84,9 @@ export class Operator {
   /** Ask how the run is to go before it is started. */
   async startWith() {
     await this.loading; // of the task that was picked just now
-    const { file } = this.link.state.mission;
+    const { file, revision } = this.link.state.mission;
     const about = file ? await startForm(file) : null;
-    if (about) startDialog(about, file, (data) => this.give("start", data, false, true));
+    if (about) startDialog(about, file, (data) => this.give("start", { ...data, revision }, false, true));
   }
 
   clearStop() {

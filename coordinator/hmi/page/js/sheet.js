@@ -80,19 +80,71 @@ export function tokensOf(task, marking) {
   return shown;
 }
 
-/** Places whose folded error branch holds a token now; `fired` are the last firings, newest last, and tell which of several. */
-export function alarmed(task, marking, fired = []) {
+/** How each element is drawn on a sheet: as itself, or as the closed macro place around it; null for what is not on it. */
+export function drawnOn(task, inside) {
+  const macros = macrosOf(task);
+  return (name) => {
+    const chain = [name, ...around(macros, name)];
+    return inside ? (chain[chain.indexOf(inside) - 1] ?? null) : chain.at(-1);
+  };
+}
+
+/** Where the error branch begins that led to each place with tokens: [{place, count, begins}]; `fired` are the last firings. */
+function errorTokens(task, marking, fired) {
   const inError = new Set(task.places.filter((p) => p.error).map((p) => p.name));
   const held = [...inError].filter((name) => marking[name]);
-  const begins = held.length ? task.arcs.filter((a) => a.direction === "in" && a.end === "error" && !inError.has(a.place)) : [];
+  const begins = held.length ? beginnings(task, inError) : [];
   const last = (arc) => fired.lastIndexOf(arc.transition);
-  const alarms = new Set();
-  for (const place of held) {
+  return held.map((place) => {
     const ways = begins.filter((arc) => reaches(task, arc.transition, inError, place));
     const newest = Math.max(-1, ...ways.map(last));
-    for (const arc of ways) if (newest < 0 || last(arc) === newest) alarms.add(arc.place);
+    return { place, count: marking[place], begins: new Set(ways.filter((arc) => newest < 0 || last(arc) === newest).map((arc) => arc.place)) };
+  });
+}
+
+/** The arcs by which a token comes into an error branch: those of an end in error, else from an action, else all there are. */
+function beginnings(task, inError) {
+  const kinds = new Map(task.places.map((p) => [p.name, p.kind]));
+  return task.transitions.filter((t) => t.error).flatMap((t) => {
+    const arcs = task.arcs.filter((a) => a.transition === t.name && a.direction === "in" && !inError.has(a.place));
+    const [errors, actions] = [arcs.filter((a) => a.end === "error"), arcs.filter((a) => kinds.get(a.place) === "action")];
+    return errors.length ? errors : actions.length ? actions : arcs;
+  });
+}
+
+/**
+ * Tokens in error branches that are not seen as such on a sheet: {folded: tokens by the element at which their branch begins,
+ * inside: tokens by closed macro place, hidden: how many are shown by nothing else}. `seen(name)` says whether an element is drawn.
+ */
+export function alarms(task, marking, inside, seen, fired = []) {
+  const drawn = drawnOn(task, inside);
+  const found = { folded: new Map(), inside: new Map(), hidden: 0 };
+  const add = (where, name, n) => where.set(name, (where.get(name) ?? 0) + n);
+  for (const { place, count, begins } of errorTokens(task, marking, fired)) {
+    const shown = drawn(place);
+    if (shown !== null && seen(shown)) {
+      if (shown !== place) add(found.inside, shown, count);
+      continue;
+    }
+    found.hidden += count;
+    for (const name of new Set([...begins].map(drawn))) if (name !== null && seen(name)) add(found.folded, name, count);
   }
-  return alarms;
+  return found;
+}
+
+const WORST = ["running", "held", "holding", "stopping"];
+
+/** The run that is shown at each place of a sheet; a closed macro place shows the worst state and the least progress inside. */
+export function runsOn(task, runs, inside) {
+  const drawn = drawnOn(task, inside);
+  const found = new Map();
+  for (const run of Object.values(runs)) {
+    const name = drawn(run.place);
+    const [before, state] = [found.get(name), run.state ?? "running"];
+    if (!before) found.set(name, { state, progress: run.progress });
+    else found.set(name, { state: WORST.indexOf(state) > WORST.indexOf(before.state) ? state : before.state, progress: Math.min(before.progress ?? 0, run.progress ?? 0) });
+  }
+  return found;
 }
 
 function reaches(task, first, inError, wanted) {

@@ -13,12 +13,13 @@ export class Bar {
     const { desk } = designer;
     this.picker = h("select", { "aria-label": "Task", onchange: () => designer.during(desk.pick(this.picker.value)) });
     this.state = h("span", { class: "saved", role: "status" });
+    this.again = h("button", { type: "button", class: "small", hidden: true, onclick: () => designer.during(desk.loadAgain()) }, "Load it");
     this.undo = tool("undo", "Undo", () => designer.undo());
     this.redo = tool("redo", "Redo", () => designer.redo());
     this.more = h("select", { "aria-label": "Import and export", onchange: () => this.exchange() }, FORMS.map(([v, t]) => h("option", { value: v }, t)));
     this.root = h("div", { class: "design-bar", role: "toolbar", "aria-label": "Task file" },
       this.picker, tool("plus", "New task", () => desk.begin()),
-      h("button", { type: "button", class: "small", onclick: () => desk.save() }, icon("save"), "Save"), this.state,
+      h("button", { type: "button", class: "small", onclick: () => desk.save() }, icon("save"), "Save"), this.state, this.again,
       h("div", { class: "gap" }), this.undo, this.redo,
       tool("copy", "Copy", () => designer.copy()), tool("paste", "Paste", () => designer.paste()), tool("trash", "Delete", () => designer.removeChosen()),
       h("button", { type: "button", class: "small", onclick: () => layOut(designer) }, icon("layout"), "Layout"),
@@ -46,8 +47,9 @@ export class Bar {
   paint() {
     const { model, desk } = this.designer;
     this.picker.value = model.name;
-    text(this.state, model.dirty ? "not saved" : !model.name ? "" : desk.isShipped ? "shipped, saving makes your copy" : "saved");
-    attribute(this.state, "data-dirty", model.dirty ? "" : null);
+    this.again.hidden = !desk.isOld;
+    text(this.state, desk.isOld ? `changed outside${model.dirty ? ", and not saved" : ""}` : model.dirty ? "not saved" : !model.name ? "" : desk.isShipped ? "shipped, saving makes your copy" : "saved");
+    attribute(this.state, "data-dirty", model.dirty || desk.isOld ? "" : null);
     for (const [button, states, word] of [[this.undo, model.past, "Undo"], [this.redo, model.future, "Redo"]]) {
       button.disabled = !states.length;
       attribute(button, "title", states.length ? `${word}: ${states.at(-1).label}` : word);

@@ -2,13 +2,17 @@
 
 import { openDialog } from "../dialog.js";
 import { h } from "../dom.js";
-import { askName, exportAs, importNet, listTasks, openTask, saveTask } from "../files.js";
+import { askName, exportAs, importNet, listTasks, openTask, revisionOf, saveTask } from "../files.js";
 import { toast } from "../toast.js";
 import { emptyDocument } from "./model.js";
 
+const CHANGED = "changed";
+const LOOK_MS = 2000;
+
 export class Desk {
   constructor(designer) {
-    Object.assign(this, { designer, documents: 0, isShipped: false, last: Promise.resolve() });
+    Object.assign(this, { designer, documents: 0, isShipped: false, outside: null, last: Promise.resolve() });
+    setInterval(() => this.look(), LOOK_MS);
     this.file = h("input", { type: "file", accept: ".pnml,.xml,.toml", hidden: true, "aria-label": "File to import", onchange: () => this.importFile() });
   }
 
@@ -90,6 +94,30 @@ export class Desk {
     });
   }
 
+  /** Notice that the file was edited by another program or person since it was opened here. */
+  async look() {
+    const { name, base } = this.model;
+    if (!name || !base || this.looking || this.designer.root.hidden || document.hidden || !this.designer.link.connected) return;
+    this.looking = true;
+    const now = await revisionOf(name);
+    this.looking = false;
+    if (now === null || name !== this.model.name || base !== this.model.base) return; // not known, or saved meanwhile
+    const outside = now === base ? null : now;
+    if (outside && outside !== this.outside) toast("warning", `${name} was changed outside since it was opened here`);
+    this.outside = outside;
+    this.designer.bar.paint();
+  }
+
+  /** Whether the file is another one now than the one that lies here. */
+  get isOld() {
+    return Boolean(this.outside) && this.outside !== this.model.base;
+  }
+
+  /** Put what the file holds now on the desk. */
+  async loadAgain() {
+    if (await this.mayLeave()) await this.open(this.model.name);
+  }
+
   /** One after the other: what is asked for while a save or an import is on its way means what will lie on the desk then. */
   inTurn(step) {
     this.last = this.last.then(step, step);
@@ -125,8 +153,11 @@ export class Desk {
       toast("error", "The task has faults: they are listed below the drawing.");
       return;
     }
-    const answer = await this.designer.operator.give("start", { task: this.model.name });
+    const { operator } = this.designer;
+    if (!(await operator.hold())) return;
+    const answer = await operator.give("start", { task: this.model.name, revision: this.model.base });
     if (answer.ok) location.hash = "#Live";
+    else if (answer.code === CHANGED) await this.look();
   }
 
   async exchange(form) {

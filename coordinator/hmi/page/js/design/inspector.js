@@ -18,6 +18,7 @@ export class Inspector {
     this.designer = designer;
     this.root = h("aside", { class: "inspector", "aria-label": "Properties" });
     this.press = new Press(this.root);
+    this.root.addEventListener("focusin", () => this.later && this.draw()); // before anything is typed into the next field
   }
 
   get model() {
@@ -30,7 +31,16 @@ export class Inspector {
     const key = JSON.stringify([[...selection.names], selection.arc?.id, this.model.sheet]);
     const same = key === this.key && !force;
     if (same && (typing || this.press.holds(() => this.show(this.designer.selection)))) return;
+    // a field says that it was changed before the focus goes on to the next: that one must still be there then
+    if (this.changing) this.later = setTimeout(() => this.draw());
+    else this.draw();
     this.key = key;
+  }
+
+  draw() {
+    clearTimeout(this.later);
+    this.later = 0;
+    const { selection } = this.designer;
     const [name] = selection.names;
     if (selection.arc) fill(this.root, this.arc(selection.arc));
     else if (selection.names.size > 1) fill(this.root, this.several(selection.names));
@@ -46,7 +56,11 @@ export class Inspector {
   }
 
   input(value, onchange, properties = {}) {
-    const put = (event) => onchange(event.target.value, event);
+    const put = (event) => {
+      this.changing = true;
+      onchange(event.target.value, event);
+      this.changing = false;
+    };
     return h("input", { value: value ?? "", onchange: put, onkeydown: (e) => { keep(e); if (e.key === "Enter") e.target.blur(); if (e.key === "Escape") { e.target.value = value ?? ""; e.target.blur(); } }, spellcheck: "false", autocomplete: "off", ...properties });
   }
 

@@ -62,40 +62,41 @@ export class Pointer {
 
   // ---- arcs ---------------------------------------------------------------------------------------------------------
 
+  /**
+   * A drag draws from where it began to where it ended, whatever is selected. A press without a drag chooses: where the arc
+   * begins, or where the one that has begun ends. So what a press means is known only when it is over.
+   */
   arcDown(event, element) {
     const { designer, view } = this;
     const { tools } = designer;
-    if (!element) {
-      if (tools.arcFrom) this.arcTo(null, event);
-      return true;
-    }
-    if (tools.arcFrom && tools.arcFrom !== element.name) {
-      this.arcTo(element.name, event);
-      return true;
-    }
-    tools.from(element.name, `From ${element.name}: choose where the arc goes.`);
+    const begun = tools.arcFrom;
+    const [x0, y0] = [event.clientX, event.clientY];
+    if (!element && !begun) return true;
+    if (element && !begun) tools.from(element.name, `From ${element.name}: choose where the arc goes.`);
     const line = s("path", { class: "draft" });
     view.layers.over.append(line);
     let far = false;
     const move = (e) => {
       const [x, y] = view.at(e.clientX, e.clientY);
-      const [ax, ay] = border(element, x, y, 2);
-      far ||= Math.hypot(x - element.x, y - element.y) > 26;
-      attribute(line, "d", far ? `M${ax} ${ay}L${x} ${y}` : null);
+      far ||= element ? Math.hypot(x - element.x, y - element.y) > 26 : Math.hypot(e.clientX - x0, e.clientY - y0) > MOVED;
+      const [ax, ay] = element ? border(element, x, y, 2) : [x, y];
+      attribute(line, "d", far && element ? `M${ax} ${ay}L${x} ${y}` : null);
     };
     this.follow(event, move, (e) => {
       line.remove();
+      if (e.type === "pointercancel") return;
       const under = view.elementAt(document.elementFromPoint(e.clientX, e.clientY) ?? view.svg);
-      if (under && under.name !== element.name) this.arcTo(under.name, e);
-      else if (far && !under) this.arcTo(null, e);
+      const there = under?.name ?? null;
+      if (element && (there ? there !== element.name : far)) this.arcTo(element.name, there, e);
+      else if (element ? begun && begun !== element.name : !far) this.arcTo(begun, element?.name ?? null, e);
+      else if (element) tools.from(element.name, `From ${element.name}: choose where the arc goes.`);
     });
     return true;
   }
 
   /** End an arc at an element, or at a new one of the other kind where nothing stands. */
-  async arcTo(name, event) {
+  async arcTo(from, name, event) {
     const { designer, view } = this;
-    const from = designer.tools.arcFrom;
     const kept = designer.tools.tool;
     let to = name;
     if (!to) {

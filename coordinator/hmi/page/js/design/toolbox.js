@@ -33,6 +33,7 @@ export class Toolbox {
   }
 
   use(name) {
+    this.designer.pointer.stop(); // a drag that was begun with another tool
     this.tool = name;
     this.arcFrom = null;
     this.view.only("target", new Set());
