@@ -195,9 +195,9 @@ class WorkerPlace:
         return "starting", ""
 
     @property
-    def runs(self) -> tuple[str, ...]:
-        """Ids of the runs that it has taken and that have not ended."""
-        return (*self._runs, *(end.id for end in self._lost))
+    def busy(self) -> bool:
+        """Whether it has taken a run that has not ended."""
+        return bool(self._runs or self._lost)
 
     def pids(self) -> dict[str, int]:
         """Process ids: `actions`, and `driver` when that has a process of its own."""
