@@ -20,7 +20,7 @@ from typing import Any
 
 import pytest
 
-from tests.node.test_processes import ROOT, Nodes, Operator, operator_of, pids
+from tests.node.test_processes import ROOT, Nodes, Operator, alive, operator_of, pids
 
 pytestmark = pytest.mark.processes
 RECOVERY = 60.0
@@ -168,3 +168,36 @@ def nodes_command(file: Path) -> dict[str, Any]:
     answers: dict[str, Any] = json.loads(said.stdout)
     assert said.returncode == (0 if all(answer["up"] for answer in answers.values()) else 3), said.stderr
     return {name: answer for name, answer in answers.items() if name == "left"}
+
+
+@pytest.mark.parametrize("how", ["SIGKILL", "SIGSTOP"])
+async def test_a_keeper_that_is_killed_or_frozen_costs_no_more_than_its_worker(tmp_path: Path, how: str) -> None:
+    """The processes directly below the node: whoever looks for the node's children finds these."""
+    running = Nodes(tmp_path, "left")
+    try:
+        async with operator_of(running.directory, "left") as operator:
+            node = running.processes["left"].pid
+            workers = {*(await pids(operator, "left", "slide")).values(), *(await pids(operator, "left", "")).values()}
+            keepers = [int(one) for one in Path(f"/proc/{node}/task/{node}/children").read_text().split()]
+            assert len(keepers) == len(workers) == 3 and workers.isdisjoint(keepers)
+            for keeper in keepers:
+                os.kill(keeper, getattr(signal, how))
+            if how == "SIGSTOP":
+                hanging = [operator.call("hang", 1.0), operator.call("hang_moving", 1.0)]
+                assert [end.cause for end in await asyncio.gather(*hanging)] == ["deadline"] * 2
+                for victim in workers:
+                    with contextlib.suppress(ProcessLookupError):
+                        os.kill(victim, signal.SIGKILL)
+                for keeper in keepers:
+                    with contextlib.suppress(ProcessLookupError):
+                        os.kill(keeper, signal.SIGCONT)
+            await operator.until(partial(up, operator, workers), RECOVERY)
+            assert (await operator.call("go", to=0.0)).status == "success"
+            assert (await operator.call("add", a=1)).values == {"sum": 2}
+
+            async def gone() -> bool:
+                return not any(map(alive, [*workers, *keepers]))
+
+            await operator.until(gone)
+    finally:
+        running.stop()
