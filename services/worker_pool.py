@@ -175,17 +175,20 @@ class WorkerPool:
         """Do all that is due, and let those go that are needed no more."""
         if not self._touched and now < min(self._due.values(), default=math.inf):
             return
-        for number in self._touched | {n for n, due in self._due.items() if now >= due}:
+        self._touched.update(n for n, due in self._due.items() if now >= due)
+        for number in tuple(self._touched):
             if number in self._workers:
                 self._workers[number].advance(now)
-                self._touched.add(number)
         self._gather_reports()
-        self._leaving = [worker for worker in self._leaving if worker.children()]
+        if self._leaving:
+            self._leaving = [worker for worker in self._leaving if worker.children()]
         self._retire(now)
 
     def _retire(self, now: float) -> None:
         """Of idle workers only the lowest numbers stay; the others leave when they have been idle for long."""
         before = self._idle_since
+        if len(self._workers) <= KEPT and not before:
+            return
         spare = sorted(number for number, worker in self._workers.items() if not worker.busy)[KEPT:]
         self._idle_since = {number: before.get(number, now) for number in spare}
         self._touched |= before.keys() ^ self._idle_since.keys()  # what is due of these has changed
@@ -221,9 +224,10 @@ class WorkerPool:
         return reports
 
     def _gather_reports(self) -> None:
-        for number in sorted(self._touched & self._workers.keys()):
-            for report in self._workers[number].reports():
-                self._take_report(number, report)
+        for number in sorted(self._touched):
+            if number in self._workers:
+                for report in self._workers[number].reports():
+                    self._take_report(number, report)
 
     def _take_report(self, number: int, report: Report) -> None:
         if isinstance(report, Told):
