@@ -17,7 +17,7 @@ from typing import Any
 
 from services.comm.parentage import STOP_ROUTINE, until_ended
 from services.keeper import KILL_ORDER
-from services.pipe import pipe_pair
+from services.pipe import Counter, counter_memory, pipe_pair
 from services.worker import BORN, Setup
 
 NONE = -1
@@ -47,23 +47,26 @@ class Child:
         self.pipe, pipe_end = pipe_pair()
         self._descriptors, descriptors_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         passed = [pipe_end, descriptors_end, *([link] if link else [])]
-        numbers = [pipe_end.fileno(), descriptors_end.fileno(), link.fileno() if link else NONE]
+        memory = counter_memory()
+        numbers = [pipe_end.fileno(), descriptors_end.fileno(), link.fileno() if link else NONE, memory]
         # Only what owns a device has something to do after the node's end: its stop routine.
         patience = int(STOP_ROUTINE) if setup.device and link is None else 0
         try:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "services.keeper", *map(str, (os.getpid(), patience, *numbers))],
-                pass_fds=[end.fileno() for end in passed],
+                pass_fds=[number for number in numbers if number != NONE],
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,  # a Ctrl-C in the node's terminal is for the node: it ends its children in order
             )
         except OSError:
             self.pipe.close()
             self._descriptors.close()
+            os.close(memory)
             raise
         finally:
             for end in passed:
                 end.close()
+        self._begun = Counter(memory)
         self._worker = 0
         self._killed = ""
         self._let_go = False
@@ -81,6 +84,11 @@ class Child:
     def closed(self) -> bool:
         """Whether it can be ordered nothing any more: its pipe has ended."""
         return self.pipe.closed
+
+    @property
+    def begun(self) -> int:
+        """How many of the runs that it was given it has begun. What it has not begun when it dies was not executed."""
+        return self._begun.value
 
     @property
     def code(self) -> int | None:
@@ -169,6 +177,7 @@ class Child:
                     await until_ended(self._worker)
         self._descriptors.close()
         self._ended(self)
+        self._begun.close()
 
     def _close_pipe(self) -> None:
         if not self._let_go:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import mmap
 import os
 import socket
+import struct
 import weakref
 from typing import Any
 
@@ -14,6 +16,7 @@ import msgpack
 LARGEST = 64 << 20
 """Most bytes of one record, and of what waits to be read."""
 CHUNK = 1 << 18
+_NUMBER = struct.Struct("=Q")
 
 _ENDS: weakref.WeakSet[socket.socket] = weakref.WeakSet()
 """Sockets of this process that none that it forks may hold: the other side would take it for this one."""
@@ -121,6 +124,35 @@ class Pipe:
         """Let it go."""
         self.closed = self._ended = True
         self.socket.close()
+
+
+class Counter:
+    """A number in memory that two processes share; it can be read after the death of the one that counts."""
+
+    def __init__(self, descriptor: int) -> None:
+        """Take over a descriptor of `counter_memory`."""
+        self._memory = mmap.mmap(descriptor, _NUMBER.size)
+        os.close(descriptor)
+
+    @property
+    def value(self) -> int:
+        """What was counted."""
+        return int(_NUMBER.unpack_from(self._memory)[0])
+
+    def count(self) -> None:
+        """One more."""
+        _NUMBER.pack_into(self._memory, 0, self.value + 1)
+
+    def close(self) -> None:
+        """Let the memory go."""
+        self._memory.close()
+
+
+def counter_memory() -> int:
+    """A descriptor of memory for one `Counter` in each of two processes. Raises OSError."""
+    descriptor = os.memfd_create("counter")
+    os.ftruncate(descriptor, _NUMBER.size)
+    return descriptor
 
 
 class NewestLink:

@@ -1,7 +1,8 @@
 """A process of a node: the warm worker that runs the actions of a device (or of none), or the process of a cyclic driver.
 
-Forked by its keeper (`services/keeper.py`) with the numbers of the inherited sockets PIPE DESCRIPTORS LINK (-1: none). The node
-says over the pipe which it is to be. A process that makes its device's driver and finds it cyclic serves the driver alone.
+Forked by its keeper (`services/keeper.py`) with the numbers of the inherited sockets PIPE DESCRIPTORS LINK (-1: none) and of the
+memory BEGUN, where it counts the runs that it begins. The node says over the pipe which it is to be. A process that makes its
+device's driver and finds it cyclic serves the driver alone.
 """
 
 from __future__ import annotations
@@ -27,11 +28,11 @@ from services.device import Driver
 from services.device_process import DeviceError, DeviceLoop, take_priority
 from services.drivers import make_driver
 from services.emergency_stops import BEAT, Guard
-from services.pipe import NewestLink, Pipe, keep_from_copies
+from services.pipe import Counter, NewestLink, Pipe, keep_from_copies
 from services.place import InlinePlace
 from services.ports import ProcessPorts
 from services.remote import DeviceCommand, DeviceState, RemoteDriver
-from services.runs import Order, Raised, Sent, flat, record
+from services.runs import Begin, Order, Raised, Sent, flat, record
 from services.scripted import load as load_script
 from services.stream_outlets import StreamOutlets
 
@@ -75,6 +76,7 @@ class Worker:
         setup: Setup,
         directory: Directory,
         node: Pipe,
+        begun: Counter,
         *,
         link: NewestLink | None = None,
         driver: Driver | None = None,
@@ -84,6 +86,7 @@ class Worker:
         self._node = node
         self._guard = guard
         self._barred = ""
+        self._begun = begun
         self._link = link
         self._ports = ports
         self._remote = RemoteDriver(self._post_command, time.monotonic) if link else None
@@ -171,6 +174,8 @@ class Worker:
         else:
             order = record(items)
             assert isinstance(order, Order)
+            if isinstance(order, Begin):
+                self._begun.count()  # before it: what is not counted was certainly not executed
             self._place.take(now, order)
 
     def _report(self, now: float) -> None:
@@ -208,7 +213,7 @@ def _first(node: Pipe) -> Setup:
             sys.exit(0)
 
 
-def serve(node: Pipe, descriptors: socket.socket | None, link: NewestLink | None) -> None:
+def serve(node: Pipe, descriptors: socket.socket | None, link: NewestLink | None, begun: Counter) -> None:
     """Be what the node says. Faults of the driver go back to it as text."""
     node.post([BORN, os.getpid()])
     setup = _first(node)
@@ -226,10 +231,10 @@ def serve(node: Pipe, descriptors: socket.socket | None, link: NewestLink | None
                 node.post([READY, {"period": driver.period, "streams": ports.stream_ports(), "fifo": take_priority()}])
                 DeviceLoop(driver, ports, node, descriptors, guard).run()
                 return
-            worker = Worker(setup, directory, node, driver=driver, ports=ports, guard=guard)
+            worker = Worker(setup, directory, node, begun, driver=driver, ports=ports, guard=guard)
             streams = ports.stream_ports()
         else:
-            worker, streams = Worker(setup, directory, node, link=link), {}
+            worker, streams = Worker(setup, directory, node, begun, link=link), {}
         worker.await_device()
         node.post([READY, {"period": None, "streams": streams, "fifo": False}])
         worker.run()
@@ -252,12 +257,13 @@ def main(arguments: list[str]) -> None:
         signal.signal(number, lambda *_: None)
     os.register_at_fork(after_in_child=_take_signals)
     log_to_stderr()
-    pipe, descriptors, link = (socket.socket(fileno=int(a)) if int(a) >= 0 else None for a in arguments)
+    pipe, descriptors, link = (socket.socket(fileno=int(a)) if int(a) >= 0 else None for a in arguments[:3])
+    begun = Counter(int(arguments[3]))
     assert pipe is not None
     node, driver_link = Pipe(pipe), NewestLink(link) if link is not None else None
     keep_from_copies(*([descriptors] if descriptors is not None else []))
     try:
-        serve(node, descriptors, driver_link)
+        serve(node, descriptors, driver_link, begun)
     except MemoryError:
         os._exit(NO_MEMORY)
 

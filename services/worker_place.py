@@ -108,6 +108,8 @@ class _Watched:
     """Deadline on the node's clock."""
     posted: float | None = None
     """When its worker was told."""
+    number: int = 0
+    """The how-manieth run that this worker was given."""
     stop: Stop | None = None
     stopped_at: float = math.inf
     pong: bool = False
@@ -152,6 +154,8 @@ class WorkerPlace:
         self._halt_due: float | None = None
         self._halts = 0
         self._pings = 0
+        self._given = 0
+        """How many runs the worker was given."""
         self._commands: dict[str, str] = {}
         """Verb of each command that a process has not answered."""
         self._frozen_since: float | None = None
@@ -191,9 +195,9 @@ class WorkerPlace:
         return "starting", ""
 
     @property
-    def runs(self) -> tuple[str, ...]:
-        """Ids of the runs that it has taken and that have not ended."""
-        return (*self._runs, *(end.id for end in self._lost))
+    def busy(self) -> bool:
+        """Whether it has taken a run that has not ended."""
+        return bool(self._runs or self._lost)
 
     def pids(self) -> dict[str, int]:
         """Process ids: `actions`, and `driver` when that has a process of its own."""
@@ -278,7 +282,7 @@ class WorkerPlace:
             if self._move(Happening.DRIVER_READY):
                 self._start_due()
         elif self._move(Happening.READY):
-            self._worker, self.failed, self._died = child, "", ""
+            self._worker, self._given, self.failed, self._died = child, 0, "", ""
             self._post_waiting(self._clock())
 
     def _post_waiting(self, now: float) -> None:
@@ -304,7 +308,7 @@ class WorkerPlace:
         assert self._owner is not None
         self._worker = None
         self._died = f"the process of its actions died: {child.describe()}"
-        self._lose_runs(*_cause_of(child))
+        self._lose_runs(*_cause_of(child), child.begun)
         if self._move(Happening.ACTIONS_ENDED):
             self._halts += 1
             self._halt_due = self._clock() + STOP_LIMIT + MARGIN
@@ -321,12 +325,14 @@ class WorkerPlace:
         self.streams = {}
         self._died = f"the process of its {'driver' if driver else 'action'} died: {why}"
         if driver:
-            self._lose_runs("device_died", DRIVER_DIED)
+            self._lose_runs("device_died", DRIVER_DIED, worker.begun if worker is not None else 0)
             if worker is not None:
                 worker.kill()
         else:
             cause, text = _cause_of(child)
-            self._lose_runs(cause, f"the process of its action died: {why}" if self.failed else text)
+            if self.failed:
+                text = f"the process of its action died: {why}"
+            self._lose_runs(cause, text, child.begun)
         self._answer_commands()
         self._tell_lost(f"driver: {why}" if driver else "")
         if self._move(Happening.ALL_ENDED):
@@ -365,10 +371,16 @@ class WorkerPlace:
         self._reports.append(Ended(id_, Status.ERROR, {}, cause, text, Executed.NO))
         self._release_if_over()
 
-    def _lose_runs(self, cause: str, text: str) -> None:
-        """The process of the runs is gone: each that it had been told of ends, with what is known of it."""
+    def _lose_runs(self, cause: str, text: str, begun: int) -> None:
+        """The process of the runs is gone: each that it had begun ends, with what is known of it. What it had not begun by then
+        nobody has executed: it waits for the next process, or ends as it was stopped."""
         for id_, run in list(self._runs.items()):
             if run.posted is None:
+                continue
+            if run.number > begun:
+                run.posted = None
+                if run.stop is not None:
+                    self._end(id_, run.stop.cause, f"{run.stop.text}; its process had not begun it".lstrip("; "))
                 continue
             del self._runs[id_]
             took = self._clock() - run.posted
@@ -403,7 +415,8 @@ class WorkerPlace:
 
     def _post_begin(self, now: float, run: _Watched) -> None:
         assert self._worker is not None
-        run.posted = now
+        self._given += 1
+        run.posted, run.number = now, self._given
         self._worker.post(flat(run.begin))
 
     def _stop(self, now: float, run: _Watched, stop: Stop) -> None:

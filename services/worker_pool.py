@@ -6,6 +6,7 @@ that waits for the next run, since a process takes its time to start. Those that
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
@@ -58,6 +59,10 @@ class WorkerPool:
         """By number from 1, the lowest first: a node that has little to do uses the same ones again and again."""
         self._leaving: list[WorkerPlace] = []
         self._idle_since: dict[int, float] = {}
+        self._touched: set[int] = set()
+        """Those to which something has happened since the last step. The others need no look before they are due: a step must
+        not take longer the more workers there are."""
+        self._due: dict[int, float] = {}
         self._at: dict[str, int] = {}
         """Number of the worker that each run was given to."""
         self._asked: dict[str, int] = {}
@@ -110,16 +115,21 @@ class WorkerPool:
         self._workers[number] = WorkerPlace(
             self._setup,
             clock=self._clock,
-            changed=self._changed,
+            changed=lambda: self._touch(number),
             wanted=lambda stream: self._want(number, stream),
             spawn=self._spawn,
         )
+        self._touched.add(number)
         self._workers[number].start()
         return number
 
+    def _touch(self, number: int) -> None:
+        self._touched.add(number)
+        self._changed()
+
     def _idle(self) -> list[int]:
         """Workers without a run, the best first: ready ones, then those that start, then those that wait to be started again."""
-        idle = [number for number, worker in self._workers.items() if not worker.runs]
+        idle = [number for number, worker in self._workers.items() if not worker.busy]
         return sorted(idle, key=lambda number: (self._rank(number), number))
 
     def _rank(self, number: int) -> int:
@@ -139,6 +149,7 @@ class WorkerPool:
         elif isinstance(order, Stop | Answered):
             known = self._at.get(order.id) if isinstance(order, Stop) else self._asked.pop(order.id, None)
             if known in self._workers:
+                self._touched.add(known)
                 self._workers[known].take(now, order)
 
     def _begin(self, now: float, begin: Begin) -> None:
@@ -150,10 +161,11 @@ class WorkerPool:
             self._reports.append(Ended(begin.id, Status.ERROR, {}, "busy", self._full(), Executed.NO))
             return
         number = self._at[begin.id] = idle[0]
+        self._touched.add(number)
         if self._held:
             self._workers[number].command(now, "", "hold")
         self._workers[number].take(now, begin)
-        if not self._idle() and len(self._workers) < self._most:
+        if len(idle) == 1 and len(self._workers) < self._most:
             self._add()
 
     idle = False
@@ -161,35 +173,61 @@ class WorkerPool:
 
     def advance(self, now: float) -> None:
         """Do all that is due, and let those go that are needed no more."""
-        for worker in self._workers.values():
-            worker.advance(now)
+        if not self._touched and now < min(self._due.values(), default=math.inf):
+            return
+        self._touched.update(n for n, due in self._due.items() if now >= due)
+        for number in tuple(self._touched):
+            if number in self._workers:
+                self._workers[number].advance(now)
         self._gather_reports()
-        self._leaving = [worker for worker in self._leaving if worker.children()]
-        idle = self._idle()
-        self._idle_since = {number: self._idle_since.get(number, now) for number in idle}
-        for number in [n for n in sorted(idle)[KEPT:] if now >= self._idle_since[n] + IDLE_LIMIT]:
+        if self._leaving:
+            self._leaving = [worker for worker in self._leaving if worker.children()]
+        self._retire(now)
+
+    def _retire(self, now: float) -> None:
+        """Of idle workers only the lowest numbers stay; the others leave when they have been idle for long."""
+        before = self._idle_since
+        if len(self._workers) <= KEPT and not before:
+            return
+        spare = sorted(number for number, worker in self._workers.items() if not worker.busy)[KEPT:]
+        self._idle_since = {number: before.get(number, now) for number in spare}
+        self._touched |= before.keys() ^ self._idle_since.keys()  # what is due of these has changed
+        for number in [n for n, since in self._idle_since.items() if now >= since + IDLE_LIMIT]:
             leaver = self._workers.pop(number)
             for wanting in self._streams.values():
                 wanting.discard(number)
             leaver.close(now)
             self._leaving.append(leaver)
+            del self._idle_since[number]
+            self._due.pop(number, None)
 
     def due(self) -> float | None:
         """When `advance` has something to do at the latest (s)."""
-        times = [worker.due() for worker in self._workers.values()]
-        times += [self._idle_since[n] + IDLE_LIMIT for n in sorted(self._idle_since)[KEPT:]]
-        return min((t for t in times if t is not None), default=None)
+        for number in self._touched & self._workers.keys():
+            self._learn_due(number)
+        soonest = min(self._due.values(), default=math.inf)
+        return soonest if soonest < math.inf else None
+
+    def _learn_due(self, number: int) -> None:
+        due = self._workers[number].due()
+        retires = self._idle_since.get(number, math.inf) + IDLE_LIMIT
+        self._due[number] = min(retires, math.inf if due is None else due)
 
     def reports(self) -> list[Report]:
         """What happened since the last call, in order."""
-        self._gather_reports()
+        if self._touched:
+            self._gather_reports()
+            for number in self._touched & self._workers.keys():
+                self._learn_due(number)
+            self._touched.clear()
         reports, self._reports = self._reports, []
         return reports
 
     def _gather_reports(self) -> None:
-        for number, worker in self._workers.items():
-            for report in worker.reports():
-                self._take_report(number, report)
+        for number in sorted(self._touched):
+            if number in self._workers:
+                for report in self._workers[number].reports():
+                    self._take_report(number, report)
 
     def _take_report(self, number: int, report: Report) -> None:
         if isinstance(report, Told):
@@ -229,6 +267,7 @@ class WorkerPool:
             self._tell(id, word, why)
             return
         self._commands[id] = _Gathered(verb, asked)
+        self._touched |= asked
         for number in sorted(asked):
             self._workers[number].command(now, id, verb)
 

@@ -133,7 +133,7 @@ def test_a_node_that_is_killed_leaves_no_process(tmp_path: Path) -> None:
     with hanging_cell(tmp_path) as (launcher, node):
         os.kill(launcher, signal.SIGSTOP)  # so that it starts no other, and reaps nothing
         children = below(node)
-        assert len(children) == 4
+        assert len(children) >= 2 * 4, "each of them has its keeper"
         os.kill(node, signal.SIGKILL)
         until(lambda: not alive(children), f"left behind: {alive(children)}")
 
@@ -143,7 +143,7 @@ def test_a_launcher_that_is_killed_leaves_no_process(tmp_path: Path) -> None:
     with hanging_cell(tmp_path) as (launcher, node):
         asyncio.run(call(tmp_path, ("quick",)))
         family = below(launcher)
-        assert node in family and len(family) == 5
+        assert node in family and len(family) >= 1 + 2 * 4, "each worker has its keeper"
         os.kill(launcher, signal.SIGKILL)
         until(lambda: not alive(family), f"left behind: {alive(family)}")
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
+import os
 import select
+import signal
 import socket
+import subprocess
 import threading
 from collections.abc import Callable
 from itertools import pairwise
@@ -18,10 +22,13 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from services import memory as memory_module
 from services.action import Context, Result, Status, failure, provisional, success
+from services.comm.directory import ActionEntry
+from services.comm.parentage import until_ended
 from services.device_process import LINKED, DeviceLoop
 from services.memory import Memory, event_name
 from services.outlets import Outlets
-from services.pipe import NewestLink, Pipe, link_pair
+from services.pipe import Counter, NewestLink, Pipe, counter_memory, link_pair
+from services.place import InlinePlace
 from services.rehearsal import StillRunningError, rehearse
 from services.remote import CyclicDriver, DeviceCommand, RemoteDriver
 from services.runs import Answered, Begin, Ended, Hold, Sent, Stop, Told, flat, record
@@ -307,6 +314,73 @@ def test_a_pipe_keeps_what_does_not_fit() -> None:
     a.post([2])
     assert a.closed
     a.close()
+
+
+def test_last_words_are_read_although_the_other_end_takes_nothing_more() -> None:
+    near, far = socket.socketpair()
+    a, b = Pipe(near), Pipe(far)
+    b.post(["last", "words"])
+    b.close()
+    a.post([1])
+    assert a.closed and a.read() == [["last", "words"]]
+    a.close()
+
+
+def test_bytes_that_are_no_record_are_refused() -> None:
+    near, far = socket.socketpair()
+    a = Pipe(near)
+    far.send(b"\xc1")
+    with pytest.raises(ValueError):
+        a.read()
+    a.close()
+    far.close()
+
+
+def test_a_counter_can_be_read_after_the_end_of_the_one_that_counts() -> None:
+    descriptor = counter_memory()
+    mine, its = Counter(os.dup(descriptor)), Counter(descriptor)
+    its.count()
+    its.count()
+    its.close()
+    assert mine.value == 2
+    mine.close()
+
+
+@pytest.mark.parametrize("missing", [False, True])
+async def test_the_end_of_a_process_is_noticed_whoever_holds_its_pipe(
+    missing: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the kernel's notice, and where there is none (before Linux 5.3)."""
+    if missing:
+        monkeypatch.delattr(os, "pidfd_open")
+    process = subprocess.Popen(["sh", "-c", "sleep 60 & echo $!; exec sleep 60"], stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    holder = int(process.stdout.readline())
+    waiting = asyncio.create_task(until_ended(process.pid))
+    with pytest.raises(TimeoutError):
+        await asyncio.wait_for(asyncio.shield(waiting), 0.1)
+    process.kill()
+    await asyncio.wait_for(waiting, 60.0)
+    assert process.wait(60.0) == -signal.SIGKILL
+    os.kill(holder, signal.SIGKILL)
+    process.stdout.close()
+
+
+@pytest.mark.parametrize("by", ["order", "command"])
+def test_a_hold_ends_with_runs_that_were_stopped_before_they_began(by: str) -> None:
+    clock = Clock()
+    entry = ActionEntry("act", "tests:none", "task", "here")
+    place = InlinePlace({"act": entry}, clock=clock, substitutes={"act": lambda ctx: success()})
+    place.command(0.0, "h", "hold")
+    place.take(0.0, Begin("held", "act"))
+    if by == "order":
+        place.take(0.0, Stop("held"))
+    else:
+        place.command(0.0, "s", "stop")
+    place.take(0.0, Begin("next", "act"))
+    place.advance(0.0)
+    ends = {report.id: report.status for report in place.reports() if isinstance(report, Ended)}
+    assert ends == {"held": "error", "next": "success"}
 
 
 def test_of_states_only_the_newest_counts() -> None:

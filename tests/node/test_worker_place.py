@@ -33,6 +33,8 @@ class FakeChild:
         self._ended = ended
         self.code: int | None = None
         self.closed = self.dead = False
+        self.begun = 1 << 30
+        """How many of its runs it says to have begun: all of them, unless a test says otherwise."""
         self.link = link
         self.linked = link is not None
         self._drop(link)
@@ -324,6 +326,9 @@ class Storm:
             self.make_ready(living[-1])
         elif act == "driver dies" and drivers:
             drivers[-1].die()
+        elif act == "nothing begun":
+            for child in living:
+                child.begun = 0
         elif act == "actions die" and workers:
             workers[-1].die()
         elif act == "link lost" and workers:
@@ -391,7 +396,7 @@ class Storm:
 
 ACTS = (
     *("begin", "ready", "driver dies", "actions die", "late words", "end", "stop", "wait", "link lost"),
-    *("no memory", "garbage", "failed", "hold", "release", "status", EMERGENCY_STOP, "halted"),
+    *("no memory", "garbage", "failed", "nothing begun", "hold", "release", "status", EMERGENCY_STOP, "halted"),
 )
 
 
@@ -421,6 +426,24 @@ def test_every_stage_can_be_reached_and_left_by_the_table() -> None:
         assert {happening for at, happening in NEXT if at is stage} > {Happening.CLOSE}, stage
     waiting = {Stage.DRIVER_STARTS, Stage.ACTIONS_START, Stage.ACTIONS_DOWN, Stage.READY}
     assert all(NEXT[stage, Happening.ALL_ENDED] is Stage.DOWN for stage in waiting)
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+def test_a_run_that_a_dead_process_had_not_begun_waits_for_the_next_one(stopped: bool) -> None:
+    bench = Bench("")
+    bench.children[0].ready()
+    bench.begin("begun")
+    bench.begin("not begun")
+    if stopped:
+        bench.place.take(bench.clock.now, Stop("not begun"))
+    bench.children[0].begun = 1
+    bench.children[0].die()
+    ends = {r.id: (r.cause, r.executed) for r in bench.run(1.0) if isinstance(r, Ended)}
+    assert ends == {"begun": ("worker_died", "unknown")} | ({"not begun": ("cancelled", "no")} if stopped else {})
+    bench.children[1].ready()
+    bench.run(0.0)
+    begins = [order.id for order in bench.children[1].orders() if isinstance(order, Begin)]
+    assert begins == ([] if stopped else ["not begun"])
 
 
 def test_the_end_of_a_former_process_does_not_touch_the_present_one() -> None:
