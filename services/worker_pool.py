@@ -63,6 +63,7 @@ class WorkerPool:
         """Those to which something has happened since the last step. The others need no look before they are due: a step must
         not take longer the more workers there are."""
         self._due: dict[int, float] = {}
+        self._soonest = math.inf
         self._at: dict[str, int] = {}
         """Number of the worker that each run was given to."""
         self._asked: dict[str, int] = {}
@@ -119,6 +120,7 @@ class WorkerPool:
             wanted=lambda stream: self._want(number, stream),
             spawn=self._spawn,
         )
+        self._workers = dict(sorted(self._workers.items()))
         self._touched.add(number)
         self._workers[number].start()
         return number
@@ -153,42 +155,47 @@ class WorkerPool:
                 self._workers[known].take(now, order)
 
     def _begin(self, now: float, begin: Begin) -> None:
-        idle = self._idle()
-        # One that waits to be started again is the last choice: it may have to wait long.
-        if (not idle or self._rank(idle[0]) == 2) and len(self._workers) < self._most:
-            idle = [self._add()]
-        if not idle:
+        number = self._choose()
+        if number is None:
             self._reports.append(Ended(begin.id, Status.ERROR, {}, "busy", self._full(), Executed.NO))
             return
-        number = self._at[begin.id] = idle[0]
+        self._at[begin.id] = number
         self._touched.add(number)
         if self._held:
             self._workers[number].command(now, "", "hold")
         self._workers[number].take(now, begin)
-        if len(idle) == 1 and len(self._workers) < self._most:
+        if len(self._workers) < self._most and all(worker.busy for worker in self._workers.values()):
             self._add()
+
+    def _choose(self) -> int | None:
+        """Number of the worker for the next run, started if need be; None at the limit."""
+        for number, worker in self._workers.items():
+            if not worker.busy and worker.ready:
+                return number
+        idle = self._idle()
+        # One that waits to be started again is the last choice: it may have to wait long.
+        if (not idle or self._rank(idle[0]) == 2) and len(self._workers) < self._most:
+            return self._add()
+        return idle[0] if idle else None
 
     idle = False
     """Its processes may say something at any time."""
 
     def advance(self, now: float) -> None:
         """Do all that is due, and let those go that are needed no more."""
-        if not self._touched and now < min(self._due.values(), default=math.inf):
-            return
-        self._touched.update(n for n, due in self._due.items() if now >= due)
+        if now >= self._soonest:
+            self._touched.update(number for number, due in self._due.items() if now >= due)
         for number in tuple(self._touched):
             if number in self._workers:
                 self._workers[number].advance(now)
-        self._gather_reports()
         if self._leaving:
             self._leaving = [worker for worker in self._leaving if worker.children()]
-        self._retire(now)
+        if self._idle_since or len(self._workers) > KEPT:
+            self._retire(now)
 
     def _retire(self, now: float) -> None:
         """Of idle workers only the lowest numbers stay; the others leave when they have been idle for long."""
         before = self._idle_since
-        if len(self._workers) <= KEPT and not before:
-            return
         spare = sorted(number for number, worker in self._workers.items() if not worker.busy)[KEPT:]
         self._idle_since = {number: before.get(number, now) for number in spare}
         self._touched |= before.keys() ^ self._idle_since.keys()  # what is due of these has changed
@@ -203,10 +210,15 @@ class WorkerPool:
 
     def due(self) -> float | None:
         """When `advance` has something to do at the latest (s)."""
-        for number in self._touched & self._workers.keys():
-            self._learn_due(number)
-        soonest = min(self._due.values(), default=math.inf)
-        return soonest if soonest < math.inf else None
+        if self._touched:
+            self._gather_reports()
+            for number in self._touched & self._workers.keys():
+                self._learn_due(number)
+            self._touched.clear()
+            self._soonest = min(self._due.values(), default=math.inf)
+        if self._reports:
+            return self._clock()
+        return self._soonest if self._soonest < math.inf else None
 
     def _learn_due(self, number: int) -> None:
         due = self._workers[number].due()
@@ -217,9 +229,6 @@ class WorkerPool:
         """What happened since the last call, in order."""
         if self._touched:
             self._gather_reports()
-            for number in self._touched & self._workers.keys():
-                self._learn_due(number)
-            self._touched.clear()
         reports, self._reports = self._reports, []
         return reports
 
