@@ -13,6 +13,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from services.comm.whole_file import make_folder
+
 PR_SET_PDEATHSIG = 1  # prctl(2): a child ends with its parent, also when that is killed
 FIRST_PAUSE = 0.25
 LONGEST_PAUSE = 8.0
@@ -77,7 +79,7 @@ class Supervisor:
         respawn: bool = True,
         notice: Callable[[str], None] | None = None,
     ) -> None:
-        logs.mkdir(parents=True, exist_ok=True)
+        make_folder(logs)
         self._children = [_Child(program, logs / f"{program.name}.log") for program in programs]
         self._respawn = respawn
         self._notice = notice or (lambda _: None)

@@ -53,6 +53,7 @@ from coordinator.learning.objective import Question
 from coordinator.learning.passage import Flow, PassageKey
 from coordinator.learning.passage import merge as merge_flows
 from coordinator.learning.records import Correction
+from services.comm.whole_file import make_folder
 
 BUSY = 20.0
 """Seconds that a command waits for another one that is writing the file."""
@@ -265,7 +266,7 @@ class EstimatesFile:
     def _writing(self) -> Iterator[sqlite3.Connection]:
         """One transaction that sees nobody else's half-written work and makes the file if need be."""
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(self.path.parent)
         except OSError as fault:
             raise EstimatesError(f"{self.path}: {fault.strerror}; give a folder that can be made") from fault
         with self._open() as db:

@@ -23,6 +23,8 @@ from typing import Any
 
 import msgpack
 
+from services.comm.whole_file import make_folder, sync_folder
+
 FORMAT = 1
 MAGIC = b"PETROJ%d\n" % FORMAT
 _FAMILY = re.compile(rb"PETROJ(\d+)\n")
@@ -69,7 +71,7 @@ class JournalWriter:
         self.syncs = 0
         if header is not None:
             try:
-                path.parent.mkdir(parents=True, exist_ok=True)
+                make_folder(path.parent)
                 self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC, 0o600)
             except FileExistsError as fault:
                 raise JournalError(f"{path}: exists already; a journal is never overwritten") from fault
@@ -81,7 +83,7 @@ class JournalWriter:
             self.next_number = 0
             self.append("header", {"format": FORMAT, **header})
             self.sync()
-            _sync_folder(path.parent)
+            sync_folder(path.parent)
         else:
             self.found = self._go_on(path)
             self.next_number = len(self.found.records) + 1
@@ -162,14 +164,6 @@ class JournalWriter:
             self.sync()
         finally:
             os.close(self._file)
-
-
-def _sync_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def read_journal(path: Path) -> Journal:
