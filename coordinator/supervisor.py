@@ -12,6 +12,7 @@ import socket
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import IO
 
 from services.comm.whole_file import make_folder
 
@@ -142,6 +143,8 @@ class Supervisor:
         if ready in done:
             return
         ready.cancel()
+        if child.task in done and isinstance(fault := child.task.exception(), OSError):
+            raise fault
         said = child.log.read_bytes()[child.begun_at :] if child.log.exists() else b""
         tail = "\n".join(said.decode(errors="replace").splitlines()[-12:])
         why = "ended" if child.task in done else f"was not ready after {timeout:g} s"
@@ -161,7 +164,7 @@ class Supervisor:
                     await self._over.wait()
 
     async def _run_once(self, child: _Child) -> None:
-        with child.log.open("ab") as log:
+        with child.log.open("ab", buffering=0) as log:
             child.begun_at = log.seek(0, os.SEEK_END)
             process = await asyncio.create_subprocess_exec(
                 *child.program.command,
@@ -174,12 +177,25 @@ class Supervisor:
             if self._stopping:
                 _signal(child, signal.SIGTERM)
             assert process.stdout is not None
+            fault: OSError | None = None
             async for line in process.stdout:
-                log.write(line)
-                log.flush()
-                if b"ready" in line:
+                fault = fault or self._write(child, log, line)
+                if b"ready" in line and fault is None:
                     child.ready.set()
             await process.wait()
+            if fault is not None and not child.ready.is_set():
+                raise fault
+
+    @staticmethod
+    def _write(child: _Child, log: IO[bytes], line: bytes) -> OSError | None:
+        """To the log. A node is ended if that cannot be written before it is ready; later the node matters more than its log."""
+        try:
+            log.write(line)
+        except OSError as fault:
+            if not child.ready.is_set():
+                _signal(child, signal.SIGTERM)
+                return OSError(fault.errno, fault.strerror, str(child.log))
+        return None
 
 
 def _signal(child: _Child, number: signal.Signals) -> None:

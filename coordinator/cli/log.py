@@ -37,7 +37,8 @@ def run(options: argparse.Namespace) -> int:
     except ReplayError as fault:
         raise CommandError(1, str(fault)) from fault
     except OSError as fault:
-        raise CommandError(2, f"{options.mcap or options.out}: {fault.strerror or fault}") from fault
+        text = f"{options.mcap or options.out}: {fault.strerror or fault}; name a file that can be written"
+        raise CommandError(2, text) from fault
     return 0
 
 

@@ -269,15 +269,21 @@ class EstimatesFile:
             make_folder(self.path.parent)
         except OSError as fault:
             raise EstimatesError(f"{self.path}: {fault.strerror}; give a folder that can be made") from fault
-        with self._open() as db:
-            db.execute("BEGIN IMMEDIATE")
-            if is_empty(db):
-                self._make(db)
-            elif schema(db) < SCHEMA:
-                migrate(db)
-            self._settle(db)
-            yield db
-            db.execute("COMMIT")
+        existed = self.path.exists()
+        try:
+            with self._open() as db:
+                db.execute("BEGIN IMMEDIATE")
+                if is_empty(db):
+                    self._make(db)
+                elif schema(db) < SCHEMA:
+                    migrate(db)
+                self._settle(db)
+                yield db
+                db.execute("COMMIT")
+        except EstimatesError:
+            if not existed and self.path.is_file() and not self.path.stat().st_size:
+                self.path.unlink()  # made by this very try, on a disk that is full
+            raise
 
     def _make(self, db: sqlite3.Connection) -> None:
         for statement in TABLES.split(";"):

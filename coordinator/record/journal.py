@@ -11,6 +11,7 @@ Kinds of a mission run's journal: coordinator/record/recording.py. Why not SQLit
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
 import re
@@ -82,7 +83,14 @@ class JournalWriter:
             self._buffer += MAGIC
             self.next_number = 0
             self.append("header", {"format": FORMAT, **header})
-            self.sync()
+            try:
+                self.sync()
+            except JournalError as fault:
+                os.close(self._file)
+                path.unlink(missing_ok=True)  # of a run that has not begun nothing is left
+                with contextlib.suppress(OSError):
+                    path.parent.rmdir()  # if there is nothing else in it
+                raise JournalError(f"{fault}; give --journal a folder that can be written") from fault
             sync_folder(path.parent)
         else:
             self.found = self._go_on(path)

@@ -64,7 +64,8 @@ def run(options: argparse.Namespace, say: Callable[[str], None] = print, wait: C
         print(f"calibrate: {fault}", file=sys.stderr)
         return EXIT_BAD_INPUT
     except OSError as fault:
-        print(f"calibrate: {fault.filename or options.output}: {fault.strerror or fault}", file=sys.stderr)
+        text = f"{fault.filename or options.output}: {fault.strerror or fault}; name a file that can be used"
+        print(f"calibrate: {text}", file=sys.stderr)
         return EXIT_BAD_INPUT
     say(report(found, len(views)))
     say(f"written to {options.output}")
