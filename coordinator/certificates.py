@@ -7,7 +7,6 @@ command can be run again when a node is added; a certificate that ends within 30
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -19,6 +18,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from services.comm.credentials import CA_FILE, RENEW_CA
 from services.comm.expiry import SOON
+from services.comm.whole_file import make_folder, write_whole
 
 CA_KEY = "ca.key"
 CA_NAME = "petrobot cell authority"
@@ -43,7 +43,7 @@ def make_certificates(folder: Path, parties: Sequence[str], now: datetime | None
         raise CertificateError(f"a node is named {clash.pop()!r}, as the authority's files are; rename the node")
     written: list[str] = []
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         authority, key = _authority(folder, now, written)
         for party in parties:
             if not _lasts(folder / f"{party}.pem", now):
@@ -153,8 +153,5 @@ def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 def _write(folder: Path, name: str, data: bytes, mode: int, written: list[str]) -> None:
     """Write a file, whole or not at all; a key before its certificate, so that one that was broken off is made again."""
-    unfinished = folder / f".{name}.{os.getpid()}"
-    with os.fdopen(os.open(unfinished, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode), "wb") as file:
-        file.write(data)
-    unfinished.replace(folder / name)
+    write_whole(folder / name, data, mode=mode)
     written.append(name)

@@ -17,7 +17,7 @@ from coordinator.mission.lockstep_party import NAME, CoordinatorParty
 from coordinator.mission.mission import Mission
 from coordinator.mission.partners import FirstAlternative, Forgetful, Observer, Selector, Store
 from coordinator.record.journal import Journal, JournalWriter
-from coordinator.record.recording import EPOCH, JournalStore, last_epoch, origin_of, replay, stages
+from coordinator.record.recording import EPOCH, JournalStore, as_recorded, last_epoch, origin_of, replay, stages
 from coordinator.supervisor import Program, is_local
 from coordinator.task import Task
 from services.comm.caller import Caller
@@ -169,6 +169,7 @@ def resumed_mission(
     Raises ReplayError when the engine does not derive what the journal says.
     """
     header = journal.header
+    engine = as_recorded(engine, header)
     writer = JournalWriter(journal.path)
     journal = writer.found  # as it is now that nobody else can write it
     epoch = last_epoch(journal) + 1

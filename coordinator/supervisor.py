@@ -13,7 +13,9 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, BinaryIO
+
+from services.comm.whole_file import make_folder
 
 PR_SET_PDEATHSIG = 1  # prctl(2): a child ends with its parent, also when that is killed
 FIRST_PAUSE = 0.25
@@ -45,6 +47,8 @@ class _Child:
     begun_at: int = 0
     """Where the newest start begins in the log (bytes)."""
     starts: int = 0
+    log_fault: OSError | None = None
+    """Why its log could not be written before it was ready."""
     task: asyncio.Task[None] | None = None
 
 
@@ -80,7 +84,7 @@ class Supervisor:
         respawn: bool = True,
         notice: Callable[[str], None] | None = None,
     ) -> None:
-        logs.mkdir(parents=True, exist_ok=True)
+        make_folder(logs)
         self._children = [_Child(program, logs / f"{program.name}.log") for program in programs]
         self._respawn = respawn
         self._notice = notice or (lambda _: None)
@@ -143,6 +147,8 @@ class Supervisor:
         if ready in done:
             return
         ready.cancel()
+        if child.task in done and isinstance(fault := child.task.exception(), OSError):
+            raise fault
         said = child.log.read_bytes()[child.begun_at :] if child.log.exists() else b""
         tail = "\n".join(said.decode(errors="replace").splitlines()[-12:])
         why = "ended" if child.task in done else f"was not ready after {timeout:g} s"
@@ -162,7 +168,7 @@ class Supervisor:
                     await self._over.wait()
 
     async def _run_once(self, child: _Child) -> None:
-        with child.log.open("ab") as log:
+        with child.log.open("ab", buffering=0) as log:
             child.begun_at = log.seek(0, os.SEEK_END)
             async with output_pipe() as (end, output):
                 process = await asyncio.create_subprocess_exec(
@@ -180,6 +186,9 @@ class Supervisor:
                 await process.wait()
                 await asyncio.wait({copying}, timeout=LAST_WORDS)
                 copying.cancel()
+                fault = child.log_fault
+                if fault is not None and not child.ready.is_set():
+                    raise fault
 
 
 @asynccontextmanager
@@ -202,12 +211,19 @@ async def output_pipe(limit: int = 1 << 16) -> AsyncIterator[tuple[BinaryIO, asy
             transport.close()
 
 
-async def _copy(child: _Child, output: asyncio.StreamReader, log: BinaryIO) -> None:
-    """Write what a program says to its log; it is ready when it says so."""
+async def _copy(child: _Child, output: asyncio.StreamReader, log: IO[bytes]) -> None:
+    """Write what a program prints to its log. It is ready when it says so.
+
+    A program is ended if its log cannot be written before it is ready; later it matters more than its log.
+    """
     async for line in output:
-        log.write(line)
-        log.flush()
-        if b"ready" in line:
+        try:
+            log.write(line)
+        except OSError as fault:
+            if not child.ready.is_set():
+                child.log_fault = child.log_fault or OSError(fault.errno, fault.strerror, str(child.log))
+                _signal(child, signal.SIGTERM)
+        if b"ready" in line and child.log_fault is None:
             child.ready.set()
 
 

@@ -28,7 +28,13 @@ ALLOWED: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("coordinator.drawing", ("coordinator.net", "coordinator.task", "coordinator.conditions")),
     (
         "coordinator.analysis",
-        ("coordinator.net", "coordinator.task", "coordinator.conditions", "services.comm.compiled"),
+        (
+            "coordinator.net",
+            "coordinator.task",
+            "coordinator.conditions",
+            "services.comm.compiled",
+            "services.comm.whole_file",
+        ),
     ),
     ("coordinator.learning", ("coordinator.net", "coordinator.task")),
     ("coordinator.engine", ("coordinator.net", "coordinator.task", "coordinator.conditions")),

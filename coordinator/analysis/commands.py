@@ -27,6 +27,7 @@ from coordinator.analysis.stochastic import Measured, NoEstimate, stochastic_vie
 from coordinator.analysis.whatif import Change, change_gspn, change_net, change_task, read_change
 from coordinator.net import Net
 from coordinator.task import Place, Task, Transition
+from services.comm.whole_file import write_whole
 
 OK, FAULT, BAD_INPUT = 0, 1, 2
 
@@ -246,11 +247,13 @@ def convert_command(source: Path, target: Path, load_task: LoadTask, *, stages: 
         else:
             lost = list(model.notes)
         text, more = written(model, target)
-        target.write_text(text, encoding="utf-8")
+        write_whole(target, text)
     except (FormatError, NoEstimate, ValueError, OverflowError) as error:
         return Outcome(BAD_INPUT, _named(source, error), {"error": _named(source, error)})
     except OSError as error:
-        return Outcome(BAD_INPUT, f"{target}: {error.strerror or error}", {"error": str(error)})
+        return Outcome(
+            BAD_INPUT, f"{target}: {error.strerror or error}; name a file that can be written", {"error": str(error)}
+        )
     lost += more
     lines = [f"{source} -> {target}", *(f"not kept: {what}" for what in lost)]
     return Outcome(OK, "\n".join(lines), {"source": str(source), "target": str(target), "not_kept": lost})

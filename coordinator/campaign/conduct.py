@@ -31,7 +31,7 @@ from coordinator.campaign.spent import note_block, note_sessions, sessions
 from coordinator.campaign.summary import Summary, result_of
 from coordinator.campaign.table import Table
 from services.comm.json_text import json_text
-from services.comm.whole_file import write_whole
+from services.comm.whole_file import make_folder, write_whole
 
 AHEAD = 3
 """Blocks handed out beyond those that the workers are busy with, so that none waits while a slow one is awaited."""
@@ -67,7 +67,7 @@ Watch = Callable[[Progress], None]
 def open_folder(folder: Path, plan: Plan) -> None:
     """Make the folder of a campaign, or see that what it holds is the same campaign. Raises CampaignError."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
     except OSError as fault:
         raise CampaignError(f"{folder}: {fault.strerror or fault}; give --out a folder that can be written") from fault
     if (folder / TABLE).exists() or (folder / MANIFEST).exists():

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from coordinator.campaign.plan import Block
+from services.comm.whole_file import write_whole
 
 TIMES = "times.csv"
 TIME_COLUMNS = ("block", "worker", "cpu_s", "wall_s", "mission_s", "rss_mb")
@@ -23,10 +25,8 @@ def note_block(folder: Path, block: Block, result: Mapping[str, Any]) -> None:
 
 def note_sessions(folder: Path, sessions: Iterable[Mapping[str, Any]]) -> None:
     """Write all sessions at once, so that a kill leaves the old file or the new one."""
-    temporary = folder / f"{SESSIONS}.new"
-    temporary.unlink(missing_ok=True)
-    _append(temporary, SESSION_COLUMNS, [[session[name] for name in SESSION_COLUMNS] for session in sessions])
-    temporary.replace(folder / SESSIONS)
+    rows = [[session[name] for name in SESSION_COLUMNS] for session in sessions]
+    write_whole(folder / SESSIONS, _lines([SESSION_COLUMNS, *rows]))
 
 
 def times(folder: Path) -> list[dict[str, str]]:
@@ -46,12 +46,16 @@ def began(folder: Path) -> str | None:
 
 
 def _append(path: Path, names: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    new = not path.exists()
+    """Not synced: what a block took is told, and nothing follows from it."""
+    rows = rows if path.exists() else [names, *rows]
     with path.open("a", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        if new:
-            writer.writerow(names)
-        writer.writerows(rows)
+        file.write(_lines(rows))
+
+
+def _lines(rows: Iterable[Sequence[Any]]) -> str:
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows(rows)
+    return out.getvalue()
 
 
 def _read(path: Path) -> list[dict[str, str]]:

@@ -14,6 +14,7 @@ from coordinator.campaign.plan import TABLE as TABLE
 from coordinator.campaign.plan import Block, CampaignError
 from coordinator.campaign.rows import Row, cells, columns, read_row
 from coordinator.task import Task
+from services.comm.whole_file import sync_folder
 
 PARQUET = "table.parquet"
 
@@ -57,10 +58,13 @@ class Table:
             writer.writerow(self._columns)
         for row in rows:
             writer.writerow(cells(self._task, row, self._columns))
+        first = not self.path.exists()
         with self.path.open("ab") as file:
             file.write(out.getvalue().encode("utf-8"))
             file.flush()
             os.fsync(file.fileno())
+        if first:
+            sync_folder(self.path.parent)
 
     def rows(self) -> Iterator[Row]:
         """All rows, one after the other."""

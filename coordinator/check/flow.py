@@ -6,36 +6,17 @@ from collections.abc import Iterator
 
 from coordinator.check.findings import Finding
 from coordinator.conditions.wording import Severity, listed
-from coordinator.task import End, Kind, Scope, Task, Transition
+from coordinator.task import Kind, Scope, Task
+from coordinator.task.timeless import endless
 
 
 def timeless_cycles(task: Task) -> Iterator[Finding]:
-    """Transitions that could fire for ever without time passing.
-
-    Of the transitions that wait for nothing, those are dropped again and again that drain a place which no other of
-    them fills: they can fire only finitely often. Whatever is left may go on for ever.
-    """
-    net = task.net
-    effect = {
-        t: {p: _weight(net.produce[i], p) - _weight(net.consume[i], p) for p in range(len(net.places))}
-        for i, t in enumerate(net.transitions)
-    }
-    loose = {t.name for t in task.transitions.values() if is_timeless(t)}
-    while True:
-        filled = {p for t in loose for p, change in effect[t].items() if change > 0}
-        finite = {t for t in loose if any(change < 0 and p not in filled for p, change in effect[t].items())}
-        if not finite:
-            break
-        loose -= finite
+    """Transitions that could fire for ever without time passing."""
+    loose = endless(task)
     if loose:
         text = f"{listed(loose)} can fire again and again without time passing"
         remedy = "let one of them wait for a run, an event or a time"
         yield Finding(Severity.ERROR, "timeless-cycle", f"transitions.{min(loose)}", text, remedy)
-
-
-def is_timeless(t: Transition) -> bool:
-    """Whether the transition waits neither for an event nor for a time nor for the end of a run."""
-    return not t.events and t.after is None and not any(a.end in (End.NORMAL, End.ERROR) for a in t.inputs)
 
 
 def never_marked(task: Task) -> Iterator[Finding]:
@@ -96,7 +77,3 @@ def unused(task: Task) -> Iterator[Finding]:
             text = "conditions read it, no run writes it and it has no initial value: until global memory does, they are false"
             remedy = "give `initial`, or let a place write it with `out`"
             yield Finding(Severity.WARNING, "never-written", f"variables.{variable.name}", text, remedy)
-
-
-def _weight(arcs: tuple[tuple[int, int], ...], place: int) -> int:
-    return next((w for p, w in arcs if p == place), 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import importlib
 import sys
 from collections.abc import Callable, Sequence
@@ -13,6 +14,15 @@ exit codes: 0 the task reached its final marking (or the command did its work, a
             1 the task ended in ERROR or was aborted; or the answer is no: analyse refuses a verdict or does not know it,
               simulate was cut short, forecast disagrees, replay differs, a running task refuses an operator's command,
             2 bad input (check: the task may not run), 3 a node is unreachable, 130 interrupted"""
+
+
+FILE_FAULTS = {
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "free some space, or name a place on another disk"),
+    **dict.fromkeys((errno.EROFS, errno.EACCES, errno.EPERM), "name a place that you may write to"),
+    **dict.fromkeys((errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST), "name another place"),
+    errno.EIO: "look after the disk",
+}
+"""What to do about a file that cannot be written, by errno(3), where a command has no better words."""
 
 
 class CommandError(Exception):
@@ -131,9 +141,14 @@ def _dispatch(command: Command, arguments: Sequence[str]) -> int:
 
 
 def _run(run: Callable[[argparse.Namespace], int], options: argparse.Namespace) -> int:
-    """Run a command; keys that cannot be used are bad input, whichever command needs them."""
+    """Run a command; keys and files that cannot be used are bad input, whichever command needs them."""
     try:
         return int(run(options))
+    except OSError as fault:
+        if fault.errno not in FILE_FAULTS:
+            raise
+        what = f"{fault.filename}: {fault.strerror}" if fault.filename else str(fault.strerror)
+        raise CommandError(2, f"{what}; {FILE_FAULTS[fault.errno]}") from fault
     except Exception as fault:
         from services.comm.security import KeyFileError, KeyNeededError
 

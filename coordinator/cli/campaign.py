@@ -6,6 +6,8 @@ import argparse
 import asyncio
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -104,7 +106,7 @@ def run(options: argparse.Namespace) -> int:
         if options.check is not None:
             _refuse_misfit(options.check, plan)  # before the work, not after it
         campaign = Campaign(folder, plan, shown)
-        with held(folder):
+        with _written(folder), held(folder):
             if campaign.complete and options.json != "-":
                 print(
                     f"nothing left to do: {folder} holds all runs; remove it, or give another --out, to run them again"
@@ -125,6 +127,18 @@ def run(options: argparse.Namespace) -> int:
         print(text_of(result))
         _print_check(check)
     return 0 if check is None or check["agrees"] else 1
+
+
+@contextmanager
+def _written(folder: Path) -> Iterator[None]:
+    """A disk that is full in the middle: what is in the folder is whole blocks, and the campaign can be resumed."""
+    try:
+        yield
+    except OSError as fault:
+        text = (
+            f"{fault.filename or folder}: {fault.strerror or fault}; free some space and resume with --resume {folder}"
+        )
+        raise CommandError(2, text) from fault
 
 
 def _refuse_misfit(forecast: Path, plan: Plan) -> None:

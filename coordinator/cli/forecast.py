@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from coordinator.cli import CommandError
 from coordinator.cli.loading import load_directory, load_task, write_json
 from services.comm.quantities import whole
+from services.comm.whole_file import make_folder, write_whole
 
 if TYPE_CHECKING:
     from coordinator.campaign.plan import Plan
@@ -211,8 +212,8 @@ def _compare(registered: Path, folder: Path, options: argparse.Namespace) -> int
 
     found = compared(registered, folder)
     if options.markdown is not None:
-        options.markdown.parent.mkdir(parents=True, exist_ok=True)
-        options.markdown.write_text(agreement_markdown(found), encoding="utf-8")
+        make_folder(options.markdown.parent)
+        write_whole(options.markdown, agreement_markdown(found))
     if options.json:
         write_json(options.json, found)
     if options.json != "-":

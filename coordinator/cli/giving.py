@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coordinator.cli.loading import pictures_of, write_json
+from services.comm.whole_file import write_whole
 
 if TYPE_CHECKING:
     from coordinator.mission.mission import Mission
@@ -52,9 +53,8 @@ def give(
         from coordinator.drawing import draw
         from coordinator.report import report_html
 
-        options.report.mkdir(parents=True, exist_ok=True)
         write_json(str(options.report / "result.json"), result)
         page = options.report / "index.html"
         net = draw(task, error_branches=True)
-        page.write_text(report_html(result, timeline, net, pictures_of(task, result)), encoding="utf-8")
+        write_whole(page, report_html(result, timeline, net, pictures_of(task, result)))
         print(f"report: {page}")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
 from services.comm.json_text import json_text
+from services.comm.whole_file import make_folder, write_whole
 
 if TYPE_CHECKING:
     import argparse
@@ -141,7 +142,7 @@ def write_json(path: str, data: Any) -> None:
         print(text, end="")
         return
     try:
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-        Path(path).write_text(text, encoding="utf-8")
+        make_folder(Path(path).parent)
+        write_whole(Path(path), text)
     except OSError as fault:
         raise CommandError(2, f"{path}: {fault.strerror or fault}; give --json a file that can be written") from fault

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from coordinator.cli import CommandError
 from coordinator.cli.replaying import Recorded, recorded
+from services.comm.whole_file import write_whole
 
 EXAMPLE = "petrobot log last --format xes --out run.xes"
 
@@ -36,7 +37,8 @@ def run(options: argparse.Namespace) -> int:
     except ReplayError as fault:
         raise CommandError(1, str(fault)) from fault
     except OSError as fault:
-        raise CommandError(2, f"{options.mcap or options.out}: {fault.strerror or fault}") from fault
+        text = f"{options.mcap or options.out}: {fault.strerror or fault}; name a file that can be written"
+        raise CommandError(2, text) from fault
     return 0
 
 
@@ -61,8 +63,7 @@ def _write(path: str, lines: Iterator[str]) -> None:
         for line in lines:
             print(line)
         return
-    with Path(path).open("w", encoding="utf-8") as file:
-        file.writelines(line + "\n" for line in lines)
+    write_whole(Path(path), "".join(line + "\n" for line in lines))
 
 
 def _text(found: Recorded) -> Iterator[str]:

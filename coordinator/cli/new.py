@@ -8,6 +8,7 @@ import re
 from pathlib import Path
 
 from coordinator.cli import CommandError
+from services.comm.whole_file import make_folder, write_whole
 
 EXAMPLE = "petrobot new action close_gripper --folder mylab"
 
@@ -208,7 +209,8 @@ def _write(files: dict[Path, str]) -> None:
             raise CommandError(2, f"{path} exists already; choose another name or --folder")
     for path, text in files.items():
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(text, encoding="utf-8")
+            make_folder(path.parent)
+            write_whole(path, text)
         except OSError as fault:
-            raise CommandError(2, f"{path}: {fault.strerror or fault}") from fault
+            text = f"{path}: {fault.strerror or fault}; give --folder one that can be written"
+            raise CommandError(2, text) from fault

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
 from coordinator.cli.loading import load_task, pictures_of, write_json
+from services.comm.whole_file import make_folder, write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -68,8 +69,8 @@ def _write(page: Path, html: str, pictures: Mapping[str, str], *, quiet: bool) -
     beside = page.with_name(f"{page.stem}_pictures")
     missing = unavailable()
     try:
-        beside.mkdir(parents=True, exist_ok=True)
-        page.write_text(html, encoding="utf-8")
+        make_folder(beside)
+        write_whole(page, html)
         for name, svg in pictures.items():
             _draw(beside / name, standalone(svg), raster=not missing)
     except OSError as fault:
@@ -85,10 +86,10 @@ def _draw(path: Path, svg: str, *, raster: bool) -> None:
     """A picture's files. A task's own picture that only browsers understand stays an SVG."""
     from coordinator.report.raster import RasterError, png
 
-    path.with_name(f"{path.name}.svg").write_text(svg, encoding="utf-8")
+    write_whole(path.with_name(f"{path.name}.svg"), svg)
     if raster:
         try:
-            path.with_name(f"{path.name}.png").write_bytes(png(svg))
+            write_whole(path.with_name(f"{path.name}.png"), png(svg))
         except RasterError as fault:
             print(f"{path}.svg: no PNG: {fault}", file=sys.stderr)
 

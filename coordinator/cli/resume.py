@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import json
+import sys
 import time
+from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coordinator.cli import CommandError
+from coordinator.cli.loading import write_json
 from coordinator.cli.replaying import Recorded, recorded
 
 if TYPE_CHECKING:
@@ -20,8 +25,6 @@ EXAMPLE = "petrobot resume last --json out.json"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
-    from pathlib import Path
-
     from coordinator.cli.run import add_page_arguments
 
     parser.add_argument("run", help="a run's id or folder, or `last`")
@@ -42,8 +45,11 @@ def run(options: argparse.Namespace) -> int:
 
     found = recorded(options.run)
     folder, mode = found.journal.path.parent, found.journal.header["mode"]
-    if (folder / RESULT).exists():
-        raise CommandError(2, f"{options.run}: the run had ended; its result is {folder / RESULT}")
+    if (result := _result_of(folder / RESULT)) is not None:
+        print(f"{options.run}: the run had ended, {result['status']}; its result is {folder / RESULT}", file=sys.stderr)
+        if options.json:
+            write_json(options.json, result)
+        return _exit_code(result)
     begun = time.perf_counter()
     try:
         if mode == "lockstep":
@@ -58,6 +64,20 @@ def run(options: argparse.Namespace) -> int:
         raise CommandError(2, str(fault)) from fault
     result = {**mission.result(mode, time.perf_counter() - begun), **learned}
     give(result, found.task, timeline, options, folder)
+    return _exit_code(result)
+
+
+def _result_of(path: Path) -> dict[str, Any] | None:
+    """The result that a run has left; None if it has none yet, or only a part of one, which is then written again."""
+    try:
+        result = json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, ValueError):
+        return None
+    return result if isinstance(result, dict) and "status" in result else None
+
+
+def _exit_code(result: Mapping[str, Any]) -> int:
+    """A supervisor that resumes whatever ends is told the same by each resume: 2 is for damage alone."""
     return 0 if result["status"] == "success" else 1
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from coordinator.cli import CommandError
 from coordinator.cli.loading import load_task, task_path
+from services.comm.whole_file import write_whole
 
 if TYPE_CHECKING:
     from coordinator.drawing import Overlay
@@ -33,9 +34,10 @@ def run(options: argparse.Namespace) -> int:
         print(svg)
         return 0
     try:
-        Path(options.out).write_text(svg, encoding="utf-8")
+        write_whole(Path(options.out), svg)
     except OSError as fault:
-        raise CommandError(2, f"{options.out}: {fault.strerror or fault}") from fault
+        text = f"{options.out}: {fault.strerror or fault}; give --out a file that can be written"
+        raise CommandError(2, text) from fault
     return 0
 
 

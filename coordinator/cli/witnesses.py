@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coordinator.cli import CommandError
+from services.comm.whole_file import make_folder, write_whole
 
 if TYPE_CHECKING:
     from coordinator.analysis.report import Analysis
@@ -22,11 +23,11 @@ def draw_witnesses(analysis: Analysis, model: Task | Net, folder: Path) -> list[
     """One SVG for each verdict that is refused with a witness; gives their paths. Raises CommandError."""
     made = []
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         for name, verdict in refused(analysis):
             assert verdict.witness is not None
             path = folder / f"{analysis.name}-{name}.svg"
-            path.write_text(picture(model, name, verdict.reason, verdict.witness), encoding="utf-8")
+            write_whole(path, picture(model, name, verdict.reason, verdict.witness))
             made.append(path)
     except OSError as fault:
         raise CommandError(

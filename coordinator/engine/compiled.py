@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Final
 
 from coordinator.conditions import Expression
 from coordinator.net import Arcs, Net
 from coordinator.task import Counts, Early, End, Event, Input, Kind, PrimitiveTask, Scope, Task, Transition
 from coordinator.task.consistency import faults, is_pulse
+from coordinator.task.timeless import endless
+
+FIRINGS_OF_A_FINITE_NET: Final = 1_000_000
+"""Firings without a stimulus of a net that must come to an end by itself: no laboratory has so many tokens; half a minute."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +84,8 @@ class Compiled:
     """Latched events that are kept when nothing waits for them."""
     devices: Mapping[str, str]
     """By action: the device that it uses."""
+    firing_limit: int
+    """Firings without a stimulus after which the engine gives up (docs/semantics.md, section 6)."""
 
 
 def compile_task(task: Task, devices: Mapping[str, str]) -> Compiled:
@@ -101,7 +108,17 @@ def compile_task(task: Task, devices: Mapping[str, str]) -> Compiled:
         waiting=_index((net.transition_index[t.name], t.events) for t in flat.transitions.values()),
         kept=frozenset(e.name for e in flat.events.values() if e.early is Early.KEEP),
         devices=dict(devices),
+        firing_limit=_firing_limit(flat, net),
     )
+
+
+def _firing_limit(flat: Task, net: Net) -> int:
+    """A net whose firings must come to an end may take its time; one that might go on for ever gets what each of its
+    transitions could do once with every token that it has at the beginning, or that one firing makes."""
+    if not endless(flat):
+        return FIRINGS_OF_A_FINITE_NET
+    tokens = sum(net.initial) + sum(weight for arcs in net.produce for _, weight in arcs)
+    return min(1_000 + len(net.transitions) * tokens, FIRINGS_OF_A_FINITE_NET)
 
 
 def _index(pairs: Iterable[tuple[int, Iterable[str]]]) -> dict[str, tuple[int, ...]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Final
 
 from coordinator.conditions import ConditionFault
 from coordinator.conditions.wording import Severity
@@ -31,10 +32,14 @@ MOVING = frozenset({Mode.RUNNING, Mode.STEPPING})
 class Policy:
     """How the engine treats tasks that do not behave."""
 
-    firing_limit: int = 1000
-    """Firings without time after which it pauses."""
+    firing_limit: int | None = None
+    """Firings without time after which it pauses, as `RECORDED` runs did; None: end in ERROR after `Compiled.firing_limit`."""
     end_when_dead: bool = True
     """End in ERROR when nothing can ever happen again; else only report it and leave it to the operator."""
+
+
+RECORDED: Final = Policy(firing_limit=1000)
+"""How the engine treated the runs in journals whose header does not say that they end in ERROR instead."""
 
 
 def settle(draft: Draft, policy: Policy, cause: str, pulse: str = "", step: Suspended | None = None) -> None:
@@ -156,18 +161,23 @@ def _end_single_step(draft: Draft, current: Suspended, step: list[Match]) -> Non
 
 
 def _stops_after(draft: Draft, policy: Policy, before: tuple[int, ...], step: list[Match]) -> bool:
-    """Pause after a token entered a place with a breakpoint, or when firings take no end."""
+    """Pause after a token entered a place with a breakpoint; give up when firings take no end."""
     places = draft.compiled.net.places
     entered = [places[p] for m in step for p, _, _ in m.exit.produce if places[p] in draft.breakpoints]
     if entered:
         pause(draft, f"breakpoint at {entered[0]}")
         return True
-    if draft.timeless >= policy.firing_limit:
-        text = f"{draft.timeless} transitions fired without time passing, last {step[-1].exit.name}"
-        draft.report(Severity.ERROR, "timeless", text, step[-1].exit.name)
+    limit = draft.compiled.firing_limit if policy.firing_limit is None else policy.firing_limit
+    if draft.timeless < limit:
+        return False
+    text = f"{draft.timeless} transitions fired without time passing, last {step[-1].exit.name}"
+    draft.report(Severity.ERROR, "timeless", text, step[-1].exit.name)
+    if policy.firing_limit is None:
+        # Continued, it would fire for ever again: not even an operator could do more than edit the task.
+        abort(draft, text)
+    else:
         pause(draft, "firings without time")
-        return True
-    return False
+    return True
 
 
 def _explain_waiting(draft: Draft) -> None:

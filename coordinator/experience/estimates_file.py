@@ -53,6 +53,7 @@ from coordinator.learning.objective import Question
 from coordinator.learning.passage import Flow, PassageKey
 from coordinator.learning.passage import merge as merge_flows
 from coordinator.learning.records import Correction
+from services.comm.whole_file import make_folder
 
 BUSY = 20.0
 """Seconds that a command waits for another one that is writing the file."""
@@ -265,18 +266,24 @@ class EstimatesFile:
     def _writing(self) -> Iterator[sqlite3.Connection]:
         """One transaction that sees nobody else's half-written work and makes the file if need be."""
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(self.path.parent)
         except OSError as fault:
             raise EstimatesError(f"{self.path}: {fault.strerror}; give a folder that can be made") from fault
-        with self._open() as db:
-            db.execute("BEGIN IMMEDIATE")
-            if is_empty(db):
-                self._make(db)
-            elif schema(db) < SCHEMA:
-                migrate(db)
-            self._settle(db)
-            yield db
-            db.execute("COMMIT")
+        existed = self.path.exists()
+        try:
+            with self._open() as db:
+                db.execute("BEGIN IMMEDIATE")
+                if is_empty(db):
+                    self._make(db)
+                elif schema(db) < SCHEMA:
+                    migrate(db)
+                self._settle(db)
+                yield db
+                db.execute("COMMIT")
+        except EstimatesError:
+            if not existed and self.path.is_file() and not self.path.stat().st_size:
+                self.path.unlink()  # made by this very try, on a disk that is full
+            raise
 
     def _make(self, db: sqlite3.Connection) -> None:
         for statement in TABLES.split(";"):

@@ -21,6 +21,7 @@ from coordinator.forecast.predict import Request, predict
 from coordinator.learning.learning import Estimates
 from coordinator.task import Task
 from services.comm.json_text import finite, json_text
+from services.comm.whole_file import make_folder, write_whole
 
 SCHEMA = 1
 METHOD = (
@@ -80,9 +81,8 @@ def write(path: Path, forecast: Mapping[str, Any]) -> None:
     """Raises ForecastError; a file that is there already is never written over."""
     text = json_text(forecast, indent=2) + "\n"
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
+        make_folder(path.parent)
+        write_whole(path, text, fresh=True)
     except FileExistsError as fault:
         raise ForecastError(
             f"{path} is there already: a registered forecast stays as it is; give another --out"

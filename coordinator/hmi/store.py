@@ -5,13 +5,12 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import os
 import re
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
 from coordinator.hmi.edits import EditError, Rename, edited, parse
+from services.comm.whole_file import make_folder, write_whole
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,63}")
 LARGEST_FILE = 1024 * 1024
@@ -138,20 +137,10 @@ class TaskStore:
         path = self._path(name)
         if len(text.encode()) > LARGEST_FILE:
             raise StoreError(413, f"{name}.toml would be larger than {LARGEST_FILE} bytes")
-        temporary = ""
         try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile(dir=self._folder, prefix=f".{name}.", delete=False) as file:
-                temporary = file.name
-                file.write(text.encode())
-                file.flush()
-                os.fsync(file.fileno())
-            if path.exists():
-                os.chmod(temporary, path.stat().st_mode & 0o777)  # noqa: PTH101
-            Path(temporary).replace(path)
+            make_folder(self._folder)
+            write_whole(path, text)
         except OSError as fault:
-            with contextlib.suppress(OSError):
-                Path(temporary).unlink(missing_ok=True)
             raise StoreError(400, f"{name}.toml cannot be written: {fault}") from fault
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from coordinator.record.runfolder import DEFAULT, NoRunError, journal_of
 from services.comm.json_text import json_text
+from services.comm.whole_file import make_folder, write_whole
 
 DOOR = "operator.json"
 
@@ -33,12 +34,9 @@ class Door:
 @contextmanager
 def door_open(folder: Path, door: Door) -> Iterator[Path]:
     """Leave the door's address in a run folder for as long as it is open; its owner alone may read it (mode 600)."""
-    path, begun = folder / DOOR, folder / f"{DOOR}.new"
-    begun.unlink(missing_ok=True)  # of a coordinator that was killed
-    folder.mkdir(parents=True, exist_ok=True)
-    with os.fdopen(os.open(begun, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
-        file.write(json_text(asdict(door)))
-    begun.replace(path)  # whole or not at all: somebody may be looking for it
+    path = folder / DOOR
+    make_folder(folder)
+    write_whole(path, json_text(asdict(door)), mode=0o600)
     try:
         yield path
     finally:

@@ -25,6 +25,7 @@ from coordinator.operator.start_order import learned_of
 from coordinator.record.recording import JournalStore
 from coordinator.record.runfolder import RESULT
 from services.comm.json_text import json_text
+from services.comm.whole_file import write_whole
 
 
 class LedRun(ABC):
@@ -95,7 +96,7 @@ class LedRun(ABC):
             learned = {} if self._learning is None else learned_of(self._learning, interrupted=not whole)
         result = {**mission.result(self.mode, time.perf_counter() - begun), **learned}
         text = json_text(result, indent=2, ensure_ascii=False) + "\n"
-        await asyncio.to_thread((self.folder / RESULT).write_text, text, encoding="utf-8")
+        await asyncio.to_thread(write_whole, self.folder / RESULT, text)
         feed.emit("result", result=result)
 
     @abstractmethod

@@ -26,6 +26,7 @@ from coordinator.operator.departure import AGAIN
 from coordinator.task import Task
 from coordinator.taskfile import loads
 from services.comm.directory import Directory
+from services.comm.whole_file import make_folder
 
 REALTIME, LOCKSTEP = "realtime", "lockstep"
 MODES: Final = (REALTIME, LOCKSTEP)
@@ -150,7 +151,7 @@ def read_parameters(task: Task, given: Mapping[str, Any]) -> dict[str, Any]:
 
 def learned_of(session: LearningSession, *, interrupted: bool) -> dict[str, Any]:
     """Save what a run learned; what its result says of it. Raises EstimatesError."""
-    session.setting.path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(session.setting.path.parent)
     counted = session.save(interrupted=interrupted)
     told = {
         "file": session.setting.path.name,

@@ -11,6 +11,7 @@ Kinds of a mission run's journal: coordinator/record/recording.py. Why not SQLit
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
 import re
@@ -22,6 +23,8 @@ from pathlib import Path
 from typing import Any
 
 import msgpack
+
+from services.comm.whole_file import make_folder, sync_folder
 
 FORMAT = 1
 MAGIC = b"PETROJ%d\n" % FORMAT
@@ -69,7 +72,7 @@ class JournalWriter:
         self.syncs = 0
         if header is not None:
             try:
-                path.parent.mkdir(parents=True, exist_ok=True)
+                make_folder(path.parent)
                 self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC, 0o600)
             except FileExistsError as fault:
                 raise JournalError(f"{path}: exists already; a journal is never overwritten") from fault
@@ -80,8 +83,15 @@ class JournalWriter:
             self._buffer += MAGIC
             self.next_number = 0
             self.append("header", {"format": FORMAT, **header})
-            self.sync()
-            _sync_folder(path.parent)
+            try:
+                self.sync()
+            except JournalError as fault:
+                os.close(self._file)
+                path.unlink(missing_ok=True)  # of a run that has not begun nothing is left
+                with contextlib.suppress(OSError):
+                    path.parent.rmdir()  # if there is nothing else in it
+                raise JournalError(f"{fault}; give --journal a folder that can be written") from fault
+            sync_folder(path.parent)
         else:
             self.found = self._go_on(path)
             self.next_number = len(self.found.records) + 1
@@ -162,14 +172,6 @@ class JournalWriter:
             self.sync()
         finally:
             os.close(self._file)
-
-
-def _sync_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def read_journal(path: Path) -> Journal:

@@ -7,6 +7,7 @@ counted from the date in the journal's header.
 from __future__ import annotations
 
 import importlib
+import io
 from collections.abc import Iterable, Iterator, Mapping
 from datetime import datetime
 from pathlib import Path
@@ -17,6 +18,7 @@ from coordinator.net import Net
 from coordinator.record.journal import Journal
 from coordinator.record.recording import Step
 from services.comm.json_text import json_text
+from services.comm.whole_file import write_whole
 
 _TEXT: Final = {"type": "string"}
 _NUMBER: Final = {"type": "number"}
@@ -50,7 +52,7 @@ def write_mcap(path: Path, journal: Journal, net: Net, steps: Iterable[Step]) ->
     except ImportError:
         raise McapMissingError("MCAP files need the package mcap: pip install 'petrobot[mcap]'") from None
     count = 0
-    with path.open("wb") as file:
+    with io.BytesIO() as file:
         writer = writing.Writer(file)
         writer.start(profile="petrobot", library="petrobot")
         writer.add_metadata("petrobot", {k: str(journal.header[k]) for k in ("mission", "mode", "date", "seed")})
@@ -59,6 +61,7 @@ def write_mcap(path: Path, journal: Journal, net: Net, steps: Iterable[Step]) ->
             data = json_text(message, ensure_ascii=False).encode()
             writer.add_message(channels[name], log_time=time, publish_time=time, sequence=count, data=data)
         writer.finish()
+        write_whole(path, file.getvalue())
     return count
 
 

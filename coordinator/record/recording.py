@@ -18,7 +18,9 @@ from typing import Any
 import msgpack
 
 from coordinator.engine import Engine, Instruction, State, Stimulus, stimulus_from_plain, to_plain
+from coordinator.engine.step import RECORDED
 from coordinator.record.journal import Journal, JournalError, JournalWriter
+from coordinator.record.runfolder import TIMELESS
 
 STIMULUS = "stimulus"
 NODE = "node"
@@ -126,8 +128,14 @@ class Step:
     """The boot of each node that was spoken to then."""
 
 
+def as_recorded(engine: Engine, header: Mapping[str, Any]) -> Engine:
+    """The engine with the policy under which a journal was recorded: what it did then it does again."""
+    return engine if TIMELESS in header else Engine(engine.task, engine.compiled.devices, RECORDED)
+
+
 def replay(journal: Journal, engine: Engine) -> Iterator[Step]:
     """Derive every state and instruction of a journal again. Raises ReplayError at the first difference."""
+    engine = as_recorded(engine, journal.header)
     state, boots = engine.initial(), dict[str, str]()
     for record in journal.records:
         if record.kind == NODE:

@@ -13,6 +13,8 @@ from typing import Any
 JOURNAL = "run.journal"
 RESULT = "result.json"
 DEFAULT = Path("runs")
+TIMELESS = "timeless"
+"""Key of a journal's header: what becomes of a net that fires without end; it paused in runs whose header has no such key."""
 
 
 class NoRunError(Exception):
@@ -28,6 +30,7 @@ def header(mission: str, task: str, services: str, mode: str, rest: Mapping[str,
         "mode": mode,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "versions": {"petrobot": version("petrobot"), "python": platform.python_version()},
+        TIMELESS: "error",
         **rest,
     }
 

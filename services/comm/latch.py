@@ -16,7 +16,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-from services.comm.whole_file import write_whole
+from services.comm.whole_file import make_folder, write_whole
 
 ALL: Final = "*"
 STATE: Final = "PETROBOT_STATE"
@@ -93,7 +93,7 @@ def _read(path: Path) -> frozenset[str]:
 
 
 def _write(path: Path, names: list[str]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     write_whole(path, "\n".join(names) + "\n")
 
 

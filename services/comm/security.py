@@ -10,11 +10,12 @@ from __future__ import annotations
 import hashlib
 import hmac
 import ipaddress
-import os
 import secrets
 import stat
 from pathlib import Path
 from typing import Protocol
+
+from services.comm.whole_file import write_whole
 
 NONCE_BYTES = 32
 PROOF_BYTES = 32
@@ -105,13 +106,11 @@ def new_key() -> bytes:
 def write_key(path: Path, key: bytes) -> None:
     """Write a key file, one line of hexadecimal digits that its owner alone may read. Raises KeyFileError if it exists."""
     try:
-        handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        write_whole(path, key.hex() + "\n", mode=0o600, fresh=True)
     except FileExistsError:
         raise KeyFileError(f"{path}: exists already; remove it first if no host uses it any more") from None
     except OSError as fault:
-        raise KeyFileError(f"{path}: {fault.strerror}") from None
-    with os.fdopen(handle, "w") as file:
-        file.write(key.hex() + "\n")
+        raise KeyFileError(f"{path}: {fault.strerror}; give --file a place that can be written") from None
 
 
 def read_key(path: Path) -> bytes:

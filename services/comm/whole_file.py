@@ -1,27 +1,87 @@
-"""Writes a file in one piece: a kill or a power cut leaves the old one or the new one, never a part."""
+"""Writes a file in one piece: a kill or a power cut leaves the old one or the new one, never a part.
+
+What is written is on the disk when the function returns: the content, then the file's name in its folder, and the names of
+folders that were made for it. Nothing may be acknowledged on the strength of a file before that.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 from pathlib import Path
 
 
-def write_whole(path: Path, text: str) -> None:
-    """Replace the file's content, synced before this returns. Raises OSError, and leaves no draft behind then."""
-    draft = path.with_name(f"{path.name}.{os.getpid()}")
+def write_whole(path: Path, content: str | bytes, *, mode: int | None = None, fresh: bool = False) -> None:
+    """Replace the file's content, synced before this returns.
+
+    `mode` is the file's mode (None: that of the file there is, else the usual one). With `fresh` a file that exists is left as it
+    is. What is no regular file (a terminal, a pipe) is simply written to. Raises FileExistsError with `fresh`, else OSError; both
+    name the path, and leave no draft behind.
+    """
+    path = path.resolve()  # a link is followed, not replaced
+    data = content.encode("utf-8") if isinstance(content, str) else content
+    draft = path.with_name(f".{path.name[-200:]}.{os.getpid()}")
     try:
-        with draft.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        draft.replace(path)
-    except OSError:
+        if path.exists() and not path.is_file():
+            path.write_bytes(data)
+            return
+        if mode is None:
+            mode = path.stat().st_mode & 0o777 if path.exists() else None
+        _write_draft(draft, data, mode)
+        try:
+            if not (fresh and _linked(draft, path)):
+                draft.replace(path)
+        finally:
+            draft.unlink(missing_ok=True)
+        sync_folder(path.parent)  # the new name is on the disk before anything relies on it
+    except OSError as fault:
         with contextlib.suppress(OSError):
             draft.unlink(missing_ok=True)
-        raise
-    folder = os.open(path.parent, os.O_RDONLY)
+        # Written to, a file is not named by the fault; and nobody knows the draft.
+        raise OSError(fault.errno, fault.strerror or str(fault), str(path)) from fault
+
+
+def _write_draft(draft: Path, data: bytes, mode: int | None) -> None:
+    draft.unlink(missing_ok=True)  # of a process of this number that was killed
+    handle = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666 if mode is None else 0o600)
+    with os.fdopen(handle, "wb") as file:
+        if mode is not None:
+            os.fchmod(file.fileno(), mode)
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _linked(draft: Path, path: Path) -> bool:
+    """Give the draft its name by a link, which unlike a rename fails if the name is taken; False where no links can be made."""
     try:
-        os.fsync(folder)  # the new name is on the disk before anything relies on it
+        os.link(draft, path)
+    except FileExistsError:
+        raise
+    except OSError:
+        if path.exists():
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path)) from None
+        return False
+    return True
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder and those that it stands in, their names synced before this returns. Raises OSError."""
+    if folder.is_dir():
+        return
+    make_folder(folder.absolute().parent)
+    try:
+        folder.mkdir(exist_ok=True)
+    except FileExistsError:
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(folder)) from None
+    sync_folder(folder.absolute().parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Have the names in a folder on the disk. Raises OSError."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(handle)
     finally:
-        os.close(folder)
+        os.close(handle)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from services.comm.camera import open_images
 from services.comm.image import ImageSource
+from services.comm.whole_file import write_whole
 from services.vision.calibration import Calibration, CalibrationError, calibrate, find_corners
 from services.vision.calibration_file import (
     CalibrationFileError,
@@ -58,12 +59,13 @@ def run(options: argparse.Namespace, say: Callable[[str], None] = print, wait: C
             take_missing(options.views, open_images(config, time.monotonic), say, wait)
         views, board = read_views(options.views)
         found = calibrate(views, board)
-        options.output.write_text(calibration_text(found), encoding="utf-8")
+        write_whole(options.output, calibration_text(found))
     except (CalibrationError, CalibrationFileError, ConnectionError, ValueError) as fault:
         print(f"calibrate: {fault}", file=sys.stderr)
         return EXIT_BAD_INPUT
     except OSError as fault:
-        print(f"calibrate: {fault.filename or options.output}: {fault.strerror or fault}", file=sys.stderr)
+        text = f"{fault.filename or options.output}: {fault.strerror or fault}; name a file that can be used"
+        print(f"calibrate: {text}", file=sys.stderr)
         return EXIT_BAD_INPUT
     say(report(found, len(views)))
     say(f"written to {options.output}")

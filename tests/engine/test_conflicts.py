@@ -5,14 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import pytest
+
 from coordinator.engine import (
+    AddTokens,
+    CancelRun,
     Chosen,
     EventOccurred,
+    Finished,
     Fired,
     Mode,
     Policy,
+    StopConfirmed,
     Subject,
 )
+from coordinator.task import Executed, Status
 
 Plays = Callable[..., Any]
 
@@ -25,6 +32,42 @@ def test_event_free_transitions_follow_until_stable(play: Plays) -> None:
 def test_timeless_cycle_pauses(play: Plays) -> None:
     p = play("x=1 y", {"t": {"in": "x", "out": "y"}, "u": {"in": "y", "out": "x"}}, policy=Policy(firing_limit=10))
     assert len(p.fired) == 10 and p.state.mode is Mode.PAUSED and p.reports == ["timeless"]
+
+
+def test_a_net_that_fires_without_end_is_given_up(play: Plays) -> None:
+    """With nobody there to continue it: an unattended run does not wait for ever."""
+    p = play("x=3 y", {"t": {"in": "x", "out": "y"}, "u": {"in": "y", "out": "x"}})
+    (finished,) = p.of(Finished)
+    assert finished.status is Status.ERROR and "transitions fired without time passing, last" in finished.reason
+    assert p.state.mode is Mode.FINISHED and p.reports == ["timeless"]
+    assert 1_000 + 2 * (3 + 2) <= len(p.fired) < 1_000 + 2 * (3 + 2) + 4
+
+
+def test_runs_of_a_net_that_is_given_up_are_stopped_first(play: Plays) -> None:
+    net = {"t": {"in": "x", "out": "y"}, "u": {"in": "y e", "out": "x e"}}
+    p = play("x=1 y e a!=1", {**net, "go": {"in": "a:normal"}, "no": {"in": "a:error"}})
+    assert p.started == ["a#1"]
+    p(AddTokens("e", 1))
+    assert p.of(CancelRun) and p.finished is None
+    p(StopConfirmed("a#1", Executed.YES))
+    assert p.state.mode is Mode.FINISHED
+
+
+@pytest.mark.parametrize(
+    ("places", "net", "fired"),
+    [
+        ("x=1200 y", {"t": {"in": "x", "out": "y"}}, 1_200),
+        ("x=1 y z", {"t": {"in": "x", "out": "y*40"}, "u": {"in": "y", "out": "z*40"}, "v": {"in": "z"}}, 1_641),
+        ("x=800 y k=800 z", {"t": {"in": "x", "out": "y"}, "u": {"in": "y k", "out": "x"}}, 2_400),
+    ],
+    ids=["many tokens", "tokens that multiply", "a loop that a store of tokens ends"],
+)
+def test_a_net_that_comes_to_an_end_may_fire_often(
+    play: Plays, places: str, net: dict[str, dict[str, str]], fired: int
+) -> None:
+    """However many tokens there are: what must end needs no limit to end it."""
+    p = play(places, net)
+    assert len(p.fired) == fired and p.reports == [] and p.state.mode is not Mode.PAUSED
 
 
 def test_time_between_stimuli_makes_firings_no_cycle(play: Plays) -> None:

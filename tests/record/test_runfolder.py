@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 
@@ -85,5 +86,21 @@ def test_run_keeps_as_many_as_it_is_told_in_lock_step_too(tmp_path: Path, capsys
     assert len(list(runs.glob(f"*/{JOURNAL}"))) == len(list(runs.glob(f"*/{RESULT}"))) == 2
     [oldest, _] = sorted(runs.iterdir())
     assert main(["replay", str(oldest)]) == 0
-    assert main(["resume", str(oldest)]) == 2
-    assert "the run had ended" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("status", "code"), [("success", 0), ("error", 1)])
+def test_resume_of_a_run_that_had_ended_says_how(
+    status: str, code: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A supervisor resumes whatever went away: it is told how the run ended, and 2 when the journal is damaged."""
+    golden = Path(__file__).with_name("golden") / "catch_ball-undisturbed.journal"
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / JOURNAL).write_bytes(golden.read_bytes())
+    (run / RESULT).write_text(json.dumps({"status": status, "runs": 4}))
+    assert main(["resume", str(run), "--json", str(tmp_path / "out.json")]) == code
+    assert f"the run had ended, {status}" in capsys.readouterr().err
+    assert json.loads((tmp_path / "out.json").read_text()) == {"status": status, "runs": 4}
+    (run / JOURNAL).write_bytes(golden.read_bytes()[:100] + b"damaged" + golden.read_bytes()[107:])
+    assert main(["resume", str(run)]) == 2
+    assert "Traceback" not in capsys.readouterr().err

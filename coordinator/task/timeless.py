@@ -1,0 +1,35 @@
+"""Firings that wait for nothing: whether a task can go on firing for ever without time passing."""
+
+from __future__ import annotations
+
+from coordinator.task.elements import End, Transition
+from coordinator.task.model import Task
+
+
+def is_timeless(t: Transition) -> bool:
+    """Whether the transition waits neither for an event nor for a time nor for the end of a run."""
+    return not t.events and t.after is None and not any(a.end in (End.NORMAL, End.ERROR) for a in t.inputs)
+
+
+def endless(task: Task) -> set[str]:
+    """Transitions of a flat task that might fire for ever without time passing; none: every such sequence comes to an end.
+
+    Of the transitions that wait for nothing, those are dropped again and again that drain a place which no other of
+    them fills: they can fire only finitely often. Whatever is left may go on for ever.
+    """
+    net = task.net
+    effect = {
+        t: {p: _weight(net.produce[i], p) - _weight(net.consume[i], p) for p in range(len(net.places))}
+        for i, t in enumerate(net.transitions)
+    }
+    loose = {t.name for t in task.transitions.values() if is_timeless(t)}
+    while True:
+        filled = {p for t in loose for p, change in effect[t].items() if change > 0}
+        finite = {t for t in loose if any(change < 0 and p not in filled for p, change in effect[t].items())}
+        if not finite:
+            return loose
+        loose -= finite
+
+
+def _weight(arcs: tuple[tuple[int, int], ...], place: int) -> int:
+    return next((w for p, w in arcs if p == place), 0)

@@ -1,0 +1,42 @@
+"""Runs commands one after the other in the present folder, and says in JSON what each said and left behind.
+
+A process for itself, since the folder is on a disk that this process's mount namespace alone has. Its argument is a JSON list of
+command lines, each a list.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import shutil
+import sys
+from pathlib import Path
+
+from coordinator.cli import main
+
+
+def outcome(command: list[str], there: set[Path]) -> dict[str, object]:
+    """Exit code, standard error, and files that were not `there` before; they are removed."""
+    said = io.StringIO()
+    with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+        try:
+            code = main(command)
+        except Exception as fault:
+            code = -1
+            said.write(f"Traceback: {type(fault).__name__}: {fault}")
+    left = sorted(str(path) for path in Path().rglob("*") if path.is_file() and path not in there)
+    for path in set(Path().iterdir()) - there:
+        with contextlib.suppress(OSError):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+    return {"code": code, "said": said.getvalue(), "left": left}
+
+
+def run() -> None:
+    """All of them."""
+    there = set(Path().rglob("*"))
+    print(json.dumps([outcome(command, there) for command in json.loads(sys.argv[1])]))
+
+
+if __name__ == "__main__":
+    run()

@@ -1,0 +1,85 @@
+"""Every command that writes files, on a disk that is full and on one that is read-only: one line that says what, where and what to
+do, exit code 2, and no file that is empty or half written."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from coordinator.record.runfolder import RESULT
+
+pytestmark = pytest.mark.processes
+ROOT = Path(__file__).parents[2]
+GOLDEN = ROOT / "tests" / "record" / "golden" / "catch_ball-undisturbed.journal"
+SIMULATED = "run catch_ball --mode lockstep --runs 1 --quiet"
+COMMANDS = {
+    "keys": "cell.key",
+    "keys --tls": "keys",
+    "new task mine": "mine.toml",
+    "show catch_ball --out net.svg": "net.svg",
+    "convert catch_ball net.pnml": "net.pnml",
+    "check catch_ball --json found.json": "found.json",
+    "log run.journal --out log.jsonl": "log.jsonl",
+    "report run.journal --out page.html": "page.html",
+    "resume ended --json out.json": "out.json",
+    "up": "runs",
+    "serve --up": "runs",
+    "campaign catch_ball --runs 2 --workers 1 --quiet": "campaigns/catch_ball",
+    f"{SIMULATED} --journal runs": "run.journal",
+    f"{SIMULATED} --learn learned.db": "learned.db",
+    f"{SIMULATED} --report page": "page/result.json",
+    f"{SIMULATED} --json out.json": "out.json",
+}
+"""What is named in the message, by command line."""
+DISKS = {
+    "full": "dd if=/dev/zero of=fill bs=4k 2>/dev/null",
+    "read-only": "cd /; mount -o remount,ro {disk}; cd {disk}",
+}
+LIMIT = 300.0
+
+
+def _mounts() -> bool:
+    """Whether this machine lets us have a disk of our own."""
+    asked = ["unshare", "-rm", "mount", "-t", "tmpfs", "none", "/mnt"]
+    try:
+        return subprocess.run(asked, capture_output=True, timeout=LIMIT, check=False).returncode == 0
+    except OSError:
+        return False
+
+
+@pytest.mark.parametrize("disk", DISKS)
+def test_a_disk_that_cannot_be_written_is_told_in_one_line(disk: str, tmp_path: Path) -> None:
+    if not _mounts():
+        pytest.skip("this machine gives nobody a mount namespace of his own (unshare -rm)")
+    commands = [shlex.split(command) for command in COMMANDS]
+    result = shlex.quote(json.dumps({"status": "success"}))
+    steps = [
+        f"mount -t tmpfs -o size=96k none {tmp_path}",
+        f"cd {tmp_path}",
+        "mkdir ended",
+        f"cp {GOLDEN} run.journal",
+        "cp run.journal ended/",
+        f"echo {result} > ended/{RESULT}",
+        DISKS[disk].format(disk=tmp_path) + " || true",
+        f"exec {sys.executable} -B -m tests.cli.on_this_disk {shlex.quote(json.dumps(commands))}",
+    ]
+    given = ["unshare", "-rm", "bash", "-c", " && ".join(steps)]
+    done = subprocess.run(
+        given, env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin:/usr/sbin:/sbin"}, capture_output=True, text=True,
+        timeout=LIMIT, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2_000:]
+    found = json.loads(done.stdout.splitlines()[-1])
+    for (command, name), outcome in zip(COMMANDS.items(), found, strict=True):
+        said, where = outcome["said"].splitlines(), f"{disk}: petrobot {command}: {outcome}"
+        told = [line for line in said if line.startswith(f"petrobot {command.split()[0]}: ")]
+        assert "Traceback" not in outcome["said"], where
+        assert outcome["code"] == 2 and len(told) == 1 and said[-1] == told[0], where
+        assert name in told[0] and "; " in told[0], where
+        assert any(word in told[0] for word in ("No space left", "Read-only", "is full", "unable to open")), where
+        assert [path for path in outcome["left"] if not path.endswith(".log")] == [], where
