@@ -32,7 +32,7 @@ from services.comm.messages import Answer, Call, Command, Outcome
 ESCALATION: Final = 3.0
 """Seconds after a run's own time to stop that its node needs at most for the stop routine and the kill of its worker."""
 RESUMED: Final = "resumed"
-_GIVEN_UP: Final = UNSURE | {RESUMED, "refused", "unreachable"}
+_GIVEN_UP: Final = UNSURE | {RESUMED, "unreachable"}
 """Causes by which this side ended a run without word of its node."""
 _TIMERS: Final = (ArmTimer, DisarmTimer, HoldTimer, ReleaseTimer)
 
@@ -188,7 +188,7 @@ class Dispatch:
         if run is None:
             return self.late(now, outcome) if self._parted(outcome) else []
         flight = self.flights.pop(run)
-        if outcome.cause not in UNSURE or Executed(outcome.executed) is Executed.NO:
+        if outcome.cause not in UNSURE or Executed(outcome.executed) is not Executed.UNKNOWN:
             return [_run_ended(run, outcome)]
         if flight.device:
             orphan_time = self.directory.actions[flight.start.action].orphan_time
@@ -289,7 +289,7 @@ class Dispatch:
 
     def _relive_end(self, now: float, end: RunEnded | StopConfirmed) -> None:
         cause = end.cause if isinstance(end, RunEnded) else ""
-        unsure = isinstance(end, RunEnded) and cause in UNSURE and end.executed is not Executed.NO
+        unsure = isinstance(end, RunEnded) and cause in UNSURE and end.executed is Executed.UNKNOWN
         self._settled[end.run] = cause not in _GIVEN_UP
         self._parting.pop(end.run, None)
         self._fences.lift(end.run)

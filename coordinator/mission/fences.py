@@ -9,9 +9,9 @@ from typing import Final
 STOP_MARGIN: Final = 2.0
 """Seconds that a node's stop routine may take after a run's orphan time (docs/semantics.md, cancel)."""
 REBOOTED: Final = "rebooted"
-UNSURE: Final = frozenset({"lost", "no_answer", "not_accepted", REBOOTED})
-"""Causes after which a device may still be moving: its node has not said that the run is over, or is another process, and the
-former one's devices may be in the middle of their stop routines."""
+UNSURE: Final = frozenset({"lost", "no_answer", "not_accepted", "refused", REBOOTED})
+"""Causes after which, with executed = unknown, a device may still be moving: its node has not said that the run is over, or is
+another process, and the former one's devices may be in the middle of their stop routines."""
 FOR_GOOD: Final = math.inf
 
 

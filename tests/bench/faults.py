@@ -60,7 +60,7 @@ async def lose_a_node(fault: Fault) -> tuple[float, float]:
 
     with part("node") as process:
         cable = Cable(int(await asyncio.to_thread(first_line, process)))
-        caller = Caller("motion", m.Hello(1, 1, "coordinator", "coord", "c1", 1))
+        caller = Caller("motion", m.Hello(2, 2, "coordinator", "coord", "c1", 1))
         client = Client(HOST, cable.port, caller, on_notices=take)
         client.start()
         if not await client.connected(LIMIT):

@@ -141,7 +141,7 @@ async def be_node() -> None:
 
 def be_sender(port: int, period: float) -> None:
     """Sends one set point a period by absolute deadline, and stands by it: the number of periods since the beginning."""
-    sender = StreamSender("vision", STREAM, period, HOST, port)
+    sender = StreamSender("vision", STREAM, period, HOST, port, receiver="motion")
     due, number = time.monotonic(), 0
     while True:
         number += 1

@@ -32,7 +32,7 @@ class Told:
     def __init__(self, port: int) -> None:
         self.notices: list[Notice] = []
         self.changed = asyncio.Event()
-        self.caller = Caller("motion", m.Hello(1, 1, "coordinator", "coord", "c1", 1))
+        self.caller = Caller("motion", m.Hello(2, 2, "coordinator", "coord", "c1", 1))
         self.client = Client(HOST, port, self.caller, on_notices=self._take)
         self.client.start()
 
