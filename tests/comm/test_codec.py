@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from services.comm import codec
 from services.comm import messages as m
 from services.comm.canbus import Frame
-from services.comm.codec import LIMITS, MAX_CONTAINERS, ProtocolError, decode, encode
+from services.comm.codec import LIMITS, MAX_CONTAINERS, MIB, ProtocolError, decode, encode
 from services.comm.frequent import NAME_LENGTH
 from services.comm.messages import Executed
 from services.comm.party import Envelope, Posted
@@ -29,7 +29,7 @@ FRAMES = [
         "00 00 00 21 99 01 01 02 ab 63 6f 6f 72 64 69 6e 61 74 6f 72 a5 63 6f 6f 72 64 a2 62 30 03 a2 64 31 c4 02 01 02",
     ),
     (
-        m.Welcome(2, "vision", "b1", ("track",), ("c1",), "d1", b"\x07"),
+        m.Welcome(1, "vision", "b1", ("track",), ("c1",), "d1", b"\x07"),
         "00 00 00 1e 98 02 01 a6 76 69 73 69 6f 6e a2 62 31 91 a5 74 72 61 63 6b 91 a2 63 31 a2 64 31 c4 01 07",
     ),
     (m.Refuse("version", "too old"), "00 00 00 12 93 03 a7 76 65 72 73 69 6f 6e a7 74 6f 6f 20 6f 6c 64"),
@@ -269,6 +269,26 @@ def test_many_empty_containers_do_not_fill_the_memory(container: bytes) -> None:
     head = b"\x94\x04\xa1c\xa1s\x81\xa1a\xdd" + count.to_bytes(4, "big")
     with pytest.raises(ProtocolError, match="arrays and maps"):
         decode(head + container * count)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [[[]] * 20_000, [None] * 140_000, [[None] * 70_000, [1] * 70_000], {str(n): n for n in range(140_000)}],
+    ids=["arrays", "values", "values in two", "a map"],
+)
+def test_what_takes_long_to_read_is_neither_sent_nor_taken(value: Any) -> None:
+    """Its sender is told, so that only its own call ends; who sends it nevertheless loses the connection."""
+    with pytest.raises(ProtocolError, match=r"too_large: a Call: more than"):
+        encode(m.Call("c", "s", {"v": value}))
+    with pytest.raises(ProtocolError, match=r"malformed: .*more than"):
+        decode(msgpack.packb([4, "c", "s", {"v": value}]))
+
+
+def test_a_value_of_the_global_memory_fits() -> None:
+    """1 MiB of bytes, of text or of floats."""
+    for value in (bytes(MIB), "x" * MIB, [1.5] * (MIB // 9)):
+        call = m.Call("c", "memory.put", {"name": "a", "value": value})
+        assert decode(encode(call)).arguments["value"] == value  # type: ignore[union-attr]
 
 
 def test_what_is_no_plain_data_is_not_encoded() -> None:
