@@ -53,6 +53,8 @@ MAX_CONTAINERS = 20_000
 MAX_VALUES = 1 << 17
 """Most values in one message, all that its arrays and maps hold: 1 MiB of floats. Together with the limit of bytes this is what
 keeps other callers waiting while one message is read: some 30 ms at the worst."""
+ENTRY = 6
+"""Values that an entry of a map counts as: its key is checked, hashed and put in its place."""
 MAX_CONTAINERS_OF_TICK = 100_000
 """Of a TICK, which only members of one cell send each other, in lock step."""
 UNCOUNTED = MAX_CONTAINERS
@@ -355,7 +357,7 @@ class _Counter:
         self.left -= 1
         if self.left < 0:
             raise _FieldError(f"more than {self.most} arrays and maps")
-        self.values -= len(container)
+        self.values -= len(container) * (ENTRY if type(container) is dict else 1)
         if self.values < 0:
             raise _FieldError(_TOO_MANY)
         return container
@@ -378,11 +380,11 @@ def _unpack_counted(body: bytes | memoryview, kind: int) -> Any:
         counter = _Counter(MAX_CONTAINERS_OF_TICK) if len(body) > UNCOUNTED else None
         hooks: dict[str, Any] = {"list_hook": counter, "object_hook": counter}
         if counter is not None:
-            counter.values = len(body)
+            counter.values = ENTRY * len(body)
         return msgpack.unpackb(body, use_list=False, ext_hook=_extension_in, **hooks)
     counter = _Counter(MAX_CONTAINERS)
     # Arrays within arrays are counted when they end; none of those that have not ended may be longer than all may be together.
-    longest = {"max_array_len": MAX_VALUES, "max_map_len": MAX_VALUES}
+    longest = {"max_array_len": MAX_VALUES, "max_map_len": MAX_VALUES // ENTRY}
     return msgpack.unpackb(body, ext_hook=no_extension, list_hook=counter, object_hook=counter, **longest)
 
 

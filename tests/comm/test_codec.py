@@ -273,7 +273,7 @@ def test_many_empty_containers_do_not_fill_the_memory(container: bytes) -> None:
 
 @pytest.mark.parametrize(
     "value",
-    [[[]] * 20_000, [None] * 140_000, [[None] * 70_000, [1] * 70_000], {str(n): n for n in range(140_000)}],
+    [[[]] * 20_000, [None] * 140_000, [[None] * 70_000, [1] * 70_000], {str(n): n for n in range(22_000)}],
     ids=["arrays", "values", "values in two", "a map"],
 )
 def test_what_takes_long_to_read_is_neither_sent_nor_taken(value: Any) -> None:
