@@ -15,6 +15,7 @@ from services.comm.latch import Latch
 from services.comm.messages import Call, Executed, Hello, Outcome
 from services.comm.notice import Ended as CallEnded
 from services.comm.notice import Notice
+from services.comm.peers import COORDINATOR, NODE
 from services.comm.verdicts import VerdictSaid, mission_of, verdict_event
 from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
 from services.device import PICTURE
@@ -31,6 +32,8 @@ GENERAL = ""
 LOOP = "*"
 """Key of the place of services that wait, in the node's own loop."""
 STREAM_PREFIX = "stream:"
+SENDERS = frozenset((COORDINATOR, NODE))
+"""Roles that may ask for the ticket of a stream: an action of a node sends set points, a coordinator may order anything."""
 """Name of a stream's address service: this and the stream's name."""
 ANSWER_WITHIN = 1.0
 """Seconds that the devices have to answer an operator's command."""
@@ -108,7 +111,7 @@ class Node:
                 offers.update(self._service_offers(service, scope, service.name in waiting))
         if self._stream_address is not None:
             streams = [s for s in self.directory.streams if self.directory.where(s) == self.name]
-            offers.update({stream_service(s): Offer(inline=self._stream_call) for s in streams})
+            offers.update({stream_service(s): Offer(inline=self._stream_call, roles=SENDERS) for s in streams})
         return offers
 
     def _service_offers(self, service: ServiceEntry, scope: str, waits: bool) -> dict[str, Offer]:

@@ -18,7 +18,7 @@ class StreamOutlets:
 
     def __init__(self, directory: Directory, sender: str) -> None:
         self._sender = sender
-        self._periods = {s.name: s.period for s in directory.streams.values()}
+        self._streams = directory.streams
         self._credentials = credentials(directory, sender)
         self._outlets: dict[str, StreamSender] = {}
         self._asked: dict[str, float] = {}
@@ -40,8 +40,8 @@ class StreamOutlets:
             return
         if older is not None:
             older.close()
-        key = self._credentials.stream_key(ticket)
-        outlet = StreamSender(self._sender, stream, self._periods[stream], host, port, ticket=ticket, key=key)
+        key, entry = self._credentials.stream_key(ticket), self._streams[stream]
+        outlet = StreamSender(self._sender, stream, entry.period, host, port, receiver=entry.to, ticket=ticket, key=key)
         outlet.advance()
         self._outlets[stream] = outlet
 

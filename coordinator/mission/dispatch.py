@@ -35,7 +35,7 @@ ESCALATION: Final = 3.0
 RESUMED: Final = "resumed"
 NO_BOOT: Final = "unknown"
 """Names no boot of a node: boots are drawn as hexadecimal numbers."""
-_GIVEN_UP: Final = UNSURE | {RESUMED, "refused", "unreachable"}
+_GIVEN_UP: Final = UNSURE | {RESUMED, "unreachable"}
 """Causes by which this side ended a run without word of its node."""
 _TIMERS: Final = (ArmTimer, DisarmTimer, HoldTimer, ReleaseTimer)
 
@@ -200,7 +200,7 @@ class Dispatch:
         if run is None:
             return self.late(now, outcome) if self._parted(outcome) else []
         flight = self.flights.pop(run)
-        if outcome.cause not in UNSURE or Executed(outcome.executed) is Executed.NO:
+        if outcome.cause not in UNSURE or Executed(outcome.executed) is not Executed.UNKNOWN:
             return [_run_ended(run, outcome)]
         if flight.device:
             orphan_time = self.directory.actions[flight.start.action].orphan_time
@@ -303,7 +303,7 @@ class Dispatch:
 
     def _relive_end(self, now: float, end: RunEnded | StopConfirmed) -> None:
         cause = end.cause if isinstance(end, RunEnded) else ""
-        unsure = isinstance(end, RunEnded) and cause in UNSURE and end.executed is not Executed.NO
+        unsure = isinstance(end, RunEnded) and cause in UNSURE and end.executed is Executed.UNKNOWN
         self._settled[end.run] = cause not in _GIVEN_UP
         self._parting.pop(end.run, None)
         self._fences.lift(end.run)

@@ -10,9 +10,12 @@ STOP_MARGIN: Final = 2.0
 """Seconds that a node's stop routine may take after a run's orphan time (docs/semantics.md, cancel)."""
 REBOOTED: Final = "rebooted"
 FORGOTTEN: Final = "forgotten"
-UNSURE: Final = frozenset({"lost", "no_answer", "not_accepted", REBOOTED, FORGOTTEN})
-"""Causes after which a device may still be moving: its node has not said that the run is over, or cannot say how it ended, or is
-another process, and the former one's devices may be in the middle of their stop routines."""
+UNSURE: Final = frozenset({"lost", "no_answer", "not_accepted", "refused", REBOOTED, FORGOTTEN})
+"""Causes after which a device may still be moving if executed = unknown.
+
+The node has not said that the run is over, or cannot say how it ended. Or it is another process, and
+the devices of the former one may be in the middle of their stop routines.
+"""
 FOR_GOOD: Final = math.inf
 
 

@@ -105,7 +105,8 @@ class EmergencyLine:
         self.client.start()
         up = self.reached = await self.client.connected(timeout)
         if not up and not self.why:
-            self.why = f"nobody answers on {self.client.host}:{self.client.port}"
+            trouble = f": {self.client.trouble}" if self.client.answered else ""
+            self.why = f"{self.node} does not answer on {self.client.host}:{self.client.port}{trouble}"
         return up
 
     async def order(self, verb: str, timeout: float) -> dict[str, str] | None:

@@ -17,6 +17,7 @@ for another boot), forgotten (its result was kept no longer, or perhaps not even
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, Final
@@ -54,6 +55,8 @@ __all__ = ["Callee", "CancelRun", "Commanded", "Inline", "Keeping", "Offer", "Or
 
 ERROR: Final = "error"
 HOLD, RELEASE, HELD = "hold", "release", "held"
+ANSWERS: Final = 64
+"""Answers to commands that are kept. A command is repeated at once or never, and an answer is some hundred bytes."""
 
 
 class Callee:
@@ -86,6 +89,8 @@ class Callee:
         self._results = ResultStore(self._keeping, self.events.forget_run)
         self._commands: dict[str, tuple[str, str]] = {}
         """Peer and verb of each command that waits for its answer."""
+        self._answers: OrderedDict[str, tuple[str, Answer]] = OrderedDict()
+        """The newest answers with their callers, for a command that comes again."""
         self._orders: list[Order] = []
         self._messages: list[tuple[str, Message]] = []
         self._takers: Mapping[type, Callable[[float, str, Any], None]] = {
@@ -263,11 +268,23 @@ class Callee:
         self.events.acknowledge(peer, ack.source, ack.number)
 
     def _take_command(self, now: float, peer: str, command: Command) -> None:
+        if command.id in self._commands or command.id in self._answers:
+            self._known_command(peer, command.id)
+            return
         self._commands[command.id] = peer, command.verb
         if command.verb == RELEASE:
             self._running.release_all(now, [command.target] if command.target else None)
             self.soonest = min(self.soonest, self._running.due())
         self._orders.append(Commanded(command, peer))
+
+    def _known_command(self, peer: str, id_: str) -> None:
+        """A command that came before is not carried out again: its answer is said again, or comes when it is there."""
+        owner, answer = self._answers.get(id_) or (self._commands[id_][0], None)
+        if owner != peer:
+            text = f"{owner} gave a command of this id"
+            self._messages.append((peer, Answer(id_, False, {"cause": "id_taken", "text": text})))
+        elif answer is not None:
+            self._messages.append((peer, answer))
 
     # What the node reports.
 
@@ -346,7 +363,11 @@ class Callee:
         if verb == HOLD and data is not None:
             answers = data.get("answers", {})
             self._running.hold_all(now, ["" if d == self.name else d for d, said in answers.items() if said == HELD])
-        self._send(peer, Answer(id, ok, plain(data or {}, "data")))
+        answer = Answer(id, ok, plain(data or {}, "data"))
+        self._answers[id] = peer, answer
+        if len(self._answers) > ANSWERS:
+            self._answers.popitem(last=False)
+        self._send(peer, answer)
 
     # What the node takes out.
 

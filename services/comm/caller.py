@@ -238,6 +238,7 @@ class Caller:
 
     def link_down(self, now: float, reason: str, *, final: bool = False) -> None:
         """The link broke. Calls wait for it to come back, unless `final` (the peer was silent for long already)."""
+        self._absence.fail(reason)
         if not self.up:
             return
         self.up = False
@@ -250,6 +251,13 @@ class Caller:
             self._end_all(LOST, reason)
         else:
             self.connecting(now)
+
+    def unreached(self, now: float, trouble: str, *, gone: bool = False) -> None:
+        """An attempt to connect has failed; `gone`: nothing listens at the peer's address. A process that we were connected to
+        has ended then, so its calls end at once; what was never connected may still be starting."""
+        self._absence.fail(trouble)
+        if gone and self.boot and not self.up and self._absence.until < NEVER:
+            self._end_all(*self._absence.give_up())
 
     def link_refused(self, now: float, refuse: m.Refuse) -> None:
         """The peer refuses us: every call ends, also those to come, until it welcomes us."""

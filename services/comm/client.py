@@ -21,11 +21,14 @@ from typing import Any, cast
 from services.comm.caller import Caller, Notice
 from services.comm.link import READ_BUFFER, Limits, Link, Timing, clock_of, futures_of
 from services.comm.messages import Bye, Call, Executed, Message, Outcome, Refuse, Welcome
+from services.comm.security import UNPROVEN, Keys
 from services.comm.under_way import NEVER
 from services.comm.wire import ProtocolError, Side, State
 
 OnNotices = Callable[[float, list[Notice]], None]
 NOT_TRUSTED = "perhaps our certificate is not trusted there, or has ended: it takes TLS 1.3 and certificates of its own cell alone"
+_FOR_GOOD = frozenset(("version", "key_needed", "wrong_node"))
+"""Faults of the opening that trying again does not mend. With a key they are found in a proven WELCOME alone."""
 _EXPIRED = 10
 """X509_V_ERR_CERT_HAS_EXPIRED (openssl-verification-options)."""
 _NUMBERS = itertools.count(1)
@@ -40,7 +43,7 @@ class _ClientLink(Link):
     """One connection to the peer."""
 
     def __init__(self, client: Client) -> None:
-        super().__init__(Side.CLIENT, client.key, client.timing, client.limits, client.buffer)
+        super().__init__(Side.CLIENT, client.caller.peer, client.key, client.timing, client.limits, client.buffer)
         self._client = client
         self.finished = asyncio.Event()
         self.refusal: Refuse | None = None
@@ -60,7 +63,10 @@ class _ClientLink(Link):
                 self.opened()
                 client.welcomed(now, self, message)
             elif isinstance(message, Refuse):
-                self.refusal = message
+                if self.connection.proven:
+                    self.refusal = message
+                else:
+                    self.reason = f"{UNPROVEN}: {message.code}: {message.text}"
             elif not isinstance(message, Bye):
                 client.caller.receive(now, message)
         client.flush(now)
@@ -72,7 +78,7 @@ class _ClientLink(Link):
         return None
 
     def faulted(self, opening: bool, fault: ProtocolError) -> None:
-        if opening:
+        if opening and fault.code in _FOR_GOOD:
             self.refusal = Refuse(fault.code, fault.text)
 
     def over(self, now: float) -> None:
@@ -92,12 +98,13 @@ class Client:
         caller: Caller,
         *,
         on_notices: OnNotices | None = None,
-        key: bytes | None = None,
+        key: Keys | None = None,
         tls: ssl.SSLContext | None = None,
         timing: Timing | None = None,
         limits: Limits | None = None,
     ) -> None:
-        """`tls`: mutual TLS; the other end must show the certificate of the caller's peer."""
+        """`key`: the shared key, or all that are accepted. `tls`: mutual TLS; the other end must show the certificate of the
+        caller's peer. With any of them, and without, the other end must go by the name of the caller's peer."""
         self.host = host
         self.port = port
         self.caller = caller
@@ -260,6 +267,8 @@ class Client:
                 )
         except (OSError, TimeoutError) as fault:
             self.trouble, self.answered = self._said(fault), isinstance(fault, ssl.SSLError)
+            self.caller.unreached(self.now(), self.trouble, gone=isinstance(fault, ConnectionRefusedError))
+            self.flush()
             return None
         self.trouble, self.answered = "", True
         self._link = link

@@ -36,10 +36,10 @@ LIMITS: Mapping[int, int] = {
     m.Hello.KIND: 4 * KIB,
     m.Welcome.KIND: MIB,
     m.Refuse.KIND: 4 * KIB,
-    m.Call.KIND: LARGEST,
+    m.Call.KIND: 2 * MIB,
     m.Accept.KIND: KIB,
     m.Feedback.KIND: 64 * KIB,
-    m.Outcome.KIND: LARGEST,
+    m.Outcome.KIND: 2 * MIB,
     m.ResultAck.KIND: 64 * KIB,
     m.Cancel.KIND: 4 * KIB,
     m.Event.KIND: 2 * MIB,
@@ -57,12 +57,21 @@ LIMITS: Mapping[int, int] = {
     m.SetPoint.KIND: 4 * KIB,
     m.Withdraw.KIND: 16,
 }
-"""Largest body of each kind (bytes), the MAC not counted."""
+"""Largest body of each kind (bytes), the MAC not counted. A value of the global memory (1 MiB) fits into CALL and RESULT; images
+and other large data have connections of their own."""
 
-UNCOUNTED = 64 * KIB
-"""Bodies up to so many bytes are read without counting their arrays and maps."""
+MAX_VALUES = 1 << 17
+"""Most values in one message, all that its arrays and maps hold: 1 MiB of floats. Together with the limit of bytes this is what
+keeps other callers waiting while one message is read: some 30 ms at the worst."""
+ENTRY = 6
+"""Values that an entry of a map counts as: its key is checked, hashed and put in its place."""
+MAX_CONTAINERS_OF_TICK = 100_000
+"""Of a TICK, which only members of one cell send each other, in lock step."""
+UNCOUNTED = MAX_CONTAINERS
+"""Bodies up to so many bytes are read without counting what is in them: they cannot hold more."""
 _SELDOM = frozenset((m.Call.KIND, m.Outcome.KIND))
 """Kinds whose last field, a bool, is left out when it is false: a peer that does not know it yet is not bothered with it."""
+_COUNTED = frozenset((m.Call.KIND, m.Outcome.KIND, m.Event.KIND, m.Answer.KIND))
 _NUMBERS = frozenset((float, int))
 _TICK = Tick.KIND
 _ARRAY, _MESSAGE = 1, 2
@@ -249,12 +258,9 @@ def encode(message: Message) -> bytes:
     if row is None:
         row = _row(message)
     body = _packed(message, lambda: _pack(row))
-    if len(body) > UNCOUNTED:
-        if len(body) <= LIMITS[kind] and _containers(row) > MAX_CONTAINERS:
-            text = f"a {type(message).__name__} of more than {MAX_CONTAINERS:,} arrays and maps"
-            raise ProtocolError("too_large", text)
+    if len(body) > LIMITS[kind] or len(body) > UNCOUNTED:
         return _small_enough(message, body)
-    return body if len(body) <= LIMITS[kind] else _small_enough(message, body)
+    return body
 
 
 def _packed(message: Message, pack: Callable[[], bytes]) -> bytes:
@@ -272,6 +278,8 @@ def _small_enough(message: Message, body: bytes) -> bytes:
     if len(body) > limit:
         text = f"a {type(message).__name__} of {len(body):,} bytes is above its limit of {limit:,}"
         raise ProtocolError("too_large", text)
+    if len(body) > UNCOUNTED and message.KIND in _COUNTED:
+        _refuse_too_many(body, message)
     return body
 
 
@@ -294,16 +302,12 @@ def _row(message: Message) -> list[Any]:
     return row[:-1] if kind in _SELDOM and not row[-1] else row
 
 
-def _containers(value: Any) -> int:
-    """How many arrays and maps the data is made of."""
-    count, waiting = 0, [value]
-    while waiting:
-        one = waiting.pop()
-        kind = type(one)
-        if kind is list or kind is tuple or kind is dict:
-            count += 1
-            waiting += one.values() if kind is dict else one
-    return count
+def _refuse_too_many(body: bytes, message: Message) -> None:
+    """What the other side would break the connection for ends the message here."""
+    try:
+        _unpack_counted(body, message.KIND)
+    except Exception as fault:
+        raise ProtocolError("too_large", f"a {type(message).__name__}: {_not_readable(fault)}") from None
 
 
 def encode_all(messages: Iterable[Message]) -> list[bytes]:
@@ -411,30 +415,45 @@ def decode_by_table(body: bytes | memoryview, kind: int, size: int) -> Message:
 
 
 class _Counter:
-    """Counts arrays and maps while a large body is read."""
+    """Counts arrays and maps, and what they hold, while a large body is read."""
 
-    def __init__(self) -> None:
-        self.left = MAX_CONTAINERS
+    def __init__(self, containers: int) -> None:
+        self.most = self.left = containers
+        self.values = MAX_VALUES
 
     def __call__(self, container: Any) -> Any:
         self.left -= 1
         if self.left < 0:
-            raise _FieldError(f"more than {MAX_CONTAINERS} arrays and maps")
+            raise _FieldError(f"more than {self.most} arrays and maps")
+        self.values -= len(container) * (ENTRY if type(container) is dict else 1)
+        if self.values < 0:
+            raise _FieldError(_TOO_MANY)
         return container
+
+
+_TOO_MANY = f"more than {MAX_VALUES} values"
 
 
 def _not_readable(fault: Exception) -> _FieldError:
     if isinstance(fault, (_FieldError, NotPlainError, ProtocolError)):
         return _FieldError(str(fault))
+    if "exceeds max_" in str(fault):
+        return _FieldError(_TOO_MANY)
     # msgpack raises its own kinds, ValueError, UnicodeDecodeError and RecursionError on bad bytes.
     return _FieldError(f"not msgpack: {type(fault).__name__}")
 
 
 def _unpack_counted(body: bytes | memoryview, kind: int) -> Any:
-    counter = _Counter() if len(body) > UNCOUNTED else None
     if kind == Tick.KIND:
-        return msgpack.unpackb(body, use_list=False, ext_hook=_extension_in, list_hook=counter, object_hook=counter)
-    return msgpack.unpackb(body, ext_hook=no_extension, list_hook=counter, object_hook=counter)
+        counter = _Counter(MAX_CONTAINERS_OF_TICK) if len(body) > UNCOUNTED else None
+        hooks: dict[str, Any] = {"list_hook": counter, "object_hook": counter}
+        if counter is not None:
+            counter.values = ENTRY * len(body)
+        return msgpack.unpackb(body, use_list=False, ext_hook=_extension_in, **hooks)
+    counter = _Counter(MAX_CONTAINERS)
+    # Arrays within arrays are counted when they end; none of those that have not ended may be longer than all may be together.
+    longest = {"max_array_len": MAX_VALUES, "max_map_len": MAX_VALUES // ENTRY}
+    return msgpack.unpackb(body, ext_hook=no_extension, list_hook=counter, object_hook=counter, **longest)
 
 
 def _other_types(spec: _Spec, fields: list[Any]) -> None:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import hmac
 import ssl
-import stat
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,7 +18,7 @@ from typing import Any, Final
 
 from services.comm.directory import Directory
 from services.comm.expiry import watch
-from services.comm.security import KeyFileError, read_key
+from services.comm.security import KeyFileError, Keys, read_key, read_secret
 
 COORDINATOR: Final = "coordinator"
 """The party whose certificate the coordinator and the operator's tools show."""
@@ -34,11 +33,14 @@ RENEW_CA: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Credentials:
-    """One party's. `key` is the shared key; `folder` that of the certificates, `party` whose of them."""
+    """One party's. `key` is the shared key, or all that are accepted; `folder` that of the certificates, `party` whose of
+    them."""
 
     party: str = ""
-    key: bytes | None = None
+    key: Keys | None = None
     folder: Path | None = None
+    also: Path | None = None
+    """Folder of another authority whose certificates are accepted, too, while it is being replaced."""
 
     @property
     def guarded(self) -> bool:
@@ -53,7 +55,7 @@ class Credentials:
         """TLS of a connecting end; None without certificates. Raises KeyFileError."""
         return self._context(ssl.PROTOCOL_TLS_CLIENT)
 
-    def stream_key(self, ticket: str) -> bytes | None:
+    def stream_key(self, ticket: str) -> Keys | None:
         """What seals a set-point stream: the shared key, else, with certificates, one made of the ticket that crossed TLS.
 
         So no TLS stands in the servo's cycle. A ticket is the receiving device's secret, a dot, and the stream's own; both
@@ -77,12 +79,19 @@ class Credentials:
         if self.folder is None:
             return None
         certificate, key, ca = (self.folder / name for name in (f"{self.party}.pem", f"{self.party}.key", CA_FILE))
-        _refuse_readable(key)
+        try:
+            read_secret(key)
+        except OSError as fault:
+            raise KeyFileError(
+                f"{key}: {fault.strerror}; make it with {MADE_BY} and copy it here from where that was run"
+            ) from None
         context = ssl.SSLContext(side)
         context.minimum_version = ssl.TLSVersion.TLSv1_3
         context.verify_mode = ssl.CERT_REQUIRED
         try:
             context.load_verify_locations(ca)
+            if self.also is not None:
+                context.load_verify_locations(self.also / CA_FILE)
             context.load_cert_chain(certificate, key)
         except (OSError, ssl.SSLError) as fault:
             reason = getattr(fault, "strerror", "") or getattr(fault, "reason", "") or type(fault).__name__
@@ -92,22 +101,22 @@ class Credentials:
         return context
 
 
-def _refuse_readable(key: Path) -> None:
-    try:
-        mode = key.stat().st_mode
-    except OSError as fault:
-        raise KeyFileError(
-            f"{key}: {fault.strerror}; make it with {MADE_BY} and copy it here from where that was run"
-        ) from None
-    if stat.S_IMODE(mode) & 0o077:
-        raise KeyFileError(f"{key}: other users may read it; run `chmod 600 {key}`")
-
-
 def credentials(directory: Directory, party: str) -> Credentials:
     """The credentials of a node or of the coordinator. Raises KeyFileError when what services.toml names cannot be used."""
     keys = directory.keys
-    key = read_key(directory.file(keys["file"])) if "file" in keys else None
-    return Credentials(party, key, directory.file(keys["certificates"]) if "certificates" in keys else None)
+    if "certificates" not in keys:
+        return Credentials(party, shared_keys(directory))
+    also = directory.file(keys["also"]) if "also" in keys else None
+    return Credentials(party, None, directory.file(keys["certificates"]), also)
+
+
+def shared_keys(directory: Directory) -> Keys | None:
+    """The shared key that services.toml names, with the one that it names as accepted beside it. Raises KeyFileError."""
+    keys = directory.keys
+    if "file" not in keys:
+        return None
+    key = read_key(directory.file(keys["file"]))
+    return (key, read_key(directory.file(keys["also"]))) if "also" in keys else key
 
 
 def name_on(certificate: dict[str, Any] | None) -> str:

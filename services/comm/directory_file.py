@@ -122,7 +122,7 @@ FLAT: Mapping[str, Key] = {
     "parameters": Key("the path of a file, relative to this one", _text),
 }
 CHANNELS = ("call", "can", "image", "stream", "control")
-KEYS = ("file", "certificates")
+KEYS = ("file", "certificates", "also")
 COORDINATOR = "coordinator"
 COORDINATOR_PORT = 7299
 """Where the coordinator listens unless `[coordinator]` says otherwise."""
@@ -187,8 +187,13 @@ def read(text: str, source: str, memory: str) -> tuple[Tables, str, list[str]]:
             faults.add(
                 f"keys.{name}", f'unknown; write file = "cell.key" or certificates = "keys"{nearest(name, KEYS)}'
             )
-    if len(tables["keys"]) > 1:
+    if {"file", "certificates"} <= tables["keys"].keys():
         faults.add("keys", "a shared key and certificates; name one of them")
+    elif tables["keys"].keys() == {"also"}:
+        faults.add(
+            "keys.also",
+            'is accepted beside another key, and there is none; write file = "cell.key" or certificates = "keys", too',
+        )
     if not faults.lines:
         _check_places(tables, faults, memory)
         _check_names(tables, faults)
@@ -196,7 +201,10 @@ def read(text: str, source: str, memory: str) -> tuple[Tables, str, list[str]]:
 
 
 def _digest(data: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(data, sort_keys=True, default=str).encode()).hexdigest()
+    """Hash of the file's data but for `keys`: while keys are replaced, hosts name different ones, and a key that does not fit
+    is refused as such."""
+    told = {name: table for name, table in data.items() if name != "keys"}
+    return hashlib.sha256(json.dumps(told, sort_keys=True, default=str).encode()).hexdigest()
 
 
 def _syntax_fault(source: str, text: str) -> str:

@@ -28,7 +28,7 @@ from services.comm.directory import COORDINATOR
 from services.comm.listening import cannot_listen
 from services.comm.messages import Bye, Hello, Message, Refuse, Tick, Welcome
 from services.comm.party import Party, Posted
-from services.comm.security import NONCE_BYTES, require_key
+from services.comm.security import NONCE_BYTES, UNPROVEN, Keys, require_key
 from services.comm.tick_link import PartyLostError, TickLink, family, handshake, tune
 from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION, Connection, ProtocolError, Side
 
@@ -59,7 +59,7 @@ class Member:
         hosts: Mapping[str, str] | None = None,
         delays: Delays | None = None,
         directory: str = "",
-        key: bytes | None = None,
+        key: Keys | None = None,
         patience: float = 10.0,
         joining: float = 60.0,
         listener: socket.socket | None = None,
@@ -123,9 +123,9 @@ class Member:
             key = COORDINATOR if self.name == COORDINATOR else f"nodes.{self.name}"
             raise CellError(cannot_listen(key, host, port, fault)) from None
 
-    def _connection(self, side: Side) -> Connection:
+    def _connection(self, side: Side, server: str) -> Connection:
         nonce = secrets.token_bytes(NONCE_BYTES) if self._key is not None else b""
-        return Connection(side, key=self._key, nonce=nonce)
+        return Connection(side, server, key=self._key, nonce=nonce)
 
     def _find_place(self, deadline: float) -> None:
         """Join a cell that goes on: hear where everybody is, give the missing marks, go on behind the newest."""
@@ -169,7 +169,7 @@ class Member:
                     raise PartyLostError(peer, f"nobody answers on {host}:{port}: {fault}") from None
                 time.sleep(_RETRY)
         tune(sock)
-        connection = self._connection(Side.CLIENT)
+        connection = self._connection(Side.CLIENT, peer)
         hello = Hello(OLDEST_VERSION, NEWEST_VERSION, "party", self.name, self._boot, 0, self._directory)
         try:
             early = handshake(sock, connection, hello, deadline)
@@ -177,10 +177,12 @@ class Member:
             sock.close()
             raise PartyLostError(peer, f"no lock step with {host}:{port}: {fault}") from None
         answer = early[0]
-        if isinstance(answer, Welcome) and answer.name == peer:
+        if isinstance(answer, Welcome):
             return TickLink(peer, sock, connection, early[1:], before=before, joins=self._rejoins)
         sock.close()
-        text = answer.text if isinstance(answer, Refuse) else f"it is not {peer} that listens on {host}:{port}"
+        text = answer.text if isinstance(answer, Refuse) else "it did not welcome us"
+        if not connection.proven:
+            raise PartyLostError(peer, f"{UNPROVEN}: {text}")
         raise CellError(f"{peer}: {text}")
 
     def _admit(
@@ -193,7 +195,7 @@ class Member:
         except TimeoutError:
             raise PartyLostError(min(after), f"it did not join the cell in {self._joining:g} s") from None
         tune(sock)
-        connection = self._connection(Side.SERVER)
+        connection = self._connection(Side.SERVER, self.name)
         try:
             hello = handshake(sock, connection, None, min(deadline, time.monotonic() + 1.0))[0]
             refusal = self._refusal(hello, after)

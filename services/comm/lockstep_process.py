@@ -7,20 +7,21 @@ import signal
 import sys
 from typing import Protocol
 
+from services.comm.credentials import shared_keys
 from services.comm.directory import COORDINATOR, Directory
 from services.comm.lockstep import Delays, Member
 from services.comm.party import Party
-from services.comm.security import KeyNeededError, is_loopback, read_key
+from services.comm.security import KeyNeededError, Keys, is_loopback
 
 
-def cell_key(directory: Directory) -> bytes | None:
+def cell_key(directory: Directory) -> Keys | None:
     """What seals the ticks of a lock-step cell: the shared key, if there is one.
 
     Ticks cross no TLS (docs/decisions/lock-step-doors.md): with certificates all members must be on loopback. Raises
     KeyNeededError where they are not, KeyFileError for a key file that cannot be used.
     """
     if "file" in directory.keys:
-        return read_key(directory.file(directory.keys["file"]))
+        return shared_keys(directory)
     if "certificates" in directory.keys:
         for name, (host, _) in directory.members().items():
             if not is_loopback(host):

@@ -23,6 +23,8 @@ class Offer:
     deadline: float | None = None
     """Seconds for a call that names none."""
     inline: Inline | None = None
+    roles: frozenset[str] = frozenset()
+    """Roles of the callers that may call it; none: all."""
 
 
 @dataclass(frozen=True, slots=True)

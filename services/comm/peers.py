@@ -106,6 +106,8 @@ class Peers:
             return "old_epoch", f"{name} is at epoch {peer.epoch}, the call is of epoch {call.epoch}"
         if offer.scope == "local" and not peer.local:
             return "local_only", f"{call.service} serves callers on the host of {self._node} alone"
+        if offer.roles and peer.role not in offer.roles:
+            return "not_for_role", f"{call.service} serves {' and '.join(sorted(offer.roles))}, not a {peer.role}"
         return self._lease(now, name, peer, offer.device, in_use) if offer.device else None
 
     def _lease(

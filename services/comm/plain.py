@@ -20,7 +20,7 @@ DEPTH = 32
 
 LARGEST = 16 << 20
 """Bytes of the largest message: nothing in it has more items or characters."""
-MAX_CONTAINERS = 100_000
+MAX_CONTAINERS = 20_000
 """Most arrays and maps in one message: one byte each on the wire, some 70 in memory."""
 
 SCALARS = frozenset((NoneType, bool, int, float, str, bytes))

@@ -1,8 +1,10 @@
 """Proof of a shared key and the seal of each frame: HMAC-SHA256 (RFC 2104, FIPS 180-4) from the standard library.
 
-Both ends draw a nonce; the transcript is all bytes of HELLO and CHALLENGE. The client proves the key over the transcript,
-the server over transcript and WELCOME, and each direction gets a sealing key of its own, so neither a recorded nor a
-mirrored frame is ever accepted, and the version range cannot be changed on the way. The key itself never crosses the wire.
+Both ends draw a nonce; the transcript is all bytes of HELLO and CHALLENGE, the name of the wanted server among them. The
+client proves the key over the transcript, the server over transcript and WELCOME, and each direction gets a sealing key of
+its own, so neither a recorded nor a mirrored frame is ever accepted, and neither the version range nor the wanted name can be
+changed on the way. The key itself never crosses the wire. Without a key each frame carries a CRC-32 in the seal's place: it
+finds accidents, not attacks.
 """
 
 from __future__ import annotations
@@ -10,10 +12,12 @@ from __future__ import annotations
 import hashlib
 import hmac
 import ipaddress
+import os
 import secrets
 import stat
 from pathlib import Path
 from typing import Protocol
+from zlib import crc32
 
 from services.comm.whole_file import write_whole
 
@@ -22,6 +26,16 @@ PROOF_BYTES = 32
 SEAL_BYTES = 16
 """HMAC-SHA256 cut to its first 128 bits."""
 KEY_BYTES = 32
+LARGEST_SECRET = 1 << 16
+"""Bytes of a key file that are read at most."""
+CHECK_BYTES = 4
+"""CRC-32 (IEEE 802.3, as zlib's), big endian: in the place of proof and seal where there is no key."""
+
+UNPROVEN = "unauthenticated refusal"
+"""A refusal that does not prove the key: a man in the middle can say it, too, so it counts as a broken link, no more."""
+
+Keys = bytes | tuple[bytes, ...]
+"""The shared key, or all keys that are accepted while the key is being replaced, the newest first."""
 
 _BLOCK = 64
 
@@ -48,7 +62,7 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def require_key(name: str, host: str, key: bytes | bool | None) -> None:
+def require_key(name: str, host: str, key: Keys | bool | None) -> None:
     """Refuse to listen where other hosts can connect unless there is a key, or certificates. Raises KeyNeededError."""
     if not key and not is_loopback(host):
         raise KeyNeededError(
@@ -98,6 +112,30 @@ class Seal:
         return outer.digest()[:SEAL_BYTES]
 
 
+class Check:
+    """What stands in the place of a seal on a connection without a key: CRC-32 of the body alone.
+
+    TCP keeps the order and the number of frames, but its own sum has 16 bits and misses some of the changed ones (Stone and
+    Partridge, "When the CRC and TCP checksum disagree", SIGCOMM 2000).
+    """
+
+    __slots__ = ()
+
+    def next(self, body: bytes | memoryview) -> bytes:
+        """Check of a frame (4 bytes)."""
+        return check(body)
+
+
+def check(body: bytes | memoryview, before: bytes = b"") -> bytes:
+    """CRC-32 of `before` and `body` together (4 bytes)."""
+    return crc32(body, crc32(before)).to_bytes(CHECK_BYTES, "big")
+
+
+def all_keys(keys: Keys | None) -> tuple[bytes, ...]:
+    """The accepted keys, the newest first; none without a key."""
+    return () if keys is None else (keys,) if isinstance(keys, bytes) else keys
+
+
 def new_key() -> bytes:
     """A fresh shared key."""
     return secrets.token_bytes(KEY_BYTES)
@@ -113,21 +151,33 @@ def write_key(path: Path, key: bytes) -> None:
         raise KeyFileError(f"{path}: {fault.strerror}; give --file a place that can be written") from None
 
 
+def read_secret(path: Path) -> bytes:
+    """What is in a file that its owner alone may read. Raises KeyFileError if others may, OSError if it cannot be read.
+
+    The file is opened once, and what is looked at is what was opened: a name could lead to another file a moment later. A link
+    to it is followed, as whoever may write services.toml could name any file; whose file it is in the end decides.
+    """
+    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe of that name must not hold us up
+    with os.fdopen(handle, "rb") as file:
+        about = os.fstat(file.fileno())
+        if not stat.S_ISREG(about.st_mode):
+            raise KeyFileError(f"{path}: not a regular file; name a key file that `petrobot keys` made")
+        if about.st_uid not in (os.geteuid(), 0):
+            text = f"{path}: belongs to another user (uid {about.st_uid}), who could change it"
+            raise KeyFileError(f"{text}; run `chown {os.geteuid()} {path}`, or make another with `petrobot keys`")
+        if stat.S_IMODE(about.st_mode) & 0o077:
+            raise KeyFileError(f"{path}: other users may read it; run `chmod 600 {path}`")
+        return file.read(LARGEST_SECRET)
+
+
 def read_key(path: Path) -> bytes:
-    """The shared key in a key file. Raises KeyFileError if it is missing, readable by others, or no key."""
+    """The shared key in a key file. Raises KeyFileError if it is missing, of another user, readable by others, or no key."""
     try:
-        mode = path.stat().st_mode
-        text = path.read_text(encoding="ascii").strip()
-    except UnicodeDecodeError:
-        raise KeyFileError(f"{path}: not a key file; make one with `petrobot keys`") from None
+        key = bytes.fromhex(read_secret(path).decode("ascii").strip())
     except OSError as fault:
         raise KeyFileError(
             f"{path}: {fault.strerror}; make one with `petrobot keys` and copy it to each host"
         ) from None
-    if stat.S_IMODE(mode) & 0o077:
-        raise KeyFileError(f"{path}: other users may read it; run `chmod 600 {path}`")
-    try:
-        key = bytes.fromhex(text)
     except ValueError:
         key = b""
     if len(key) != KEY_BYTES:

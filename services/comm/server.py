@@ -22,7 +22,7 @@ from services.comm.credentials import may_speak_as, name_on
 from services.comm.expiry import DAY, look_again
 from services.comm.link import READ_BUFFER, Limits, Link, Timing
 from services.comm.messages import Answer, Bye, Call, Hello, Message, Outcome, Refuse
-from services.comm.security import is_loopback, require_key
+from services.comm.security import Keys, is_loopback, require_key
 from services.comm.tls_listener import Admission, TlsListener
 from services.comm.wire import ProtocolError, Side, State
 
@@ -41,7 +41,7 @@ class _ServerLink(Link):
     """A caller's connection."""
 
     def __init__(self, server: Server) -> None:
-        super().__init__(Side.SERVER, server.key, server.timing, server.limits, server.buffer)
+        super().__init__(Side.SERVER, server.callee.name, server.key, server.timing, server.limits, server.buffer)
         self._server = server
         self.peer = ""
         """The caller's name, once it is welcome."""
@@ -168,7 +168,7 @@ class Server:
         callee: Callee,
         *,
         on_orders: OnOrders | None = None,
-        key: bytes | None = None,
+        key: Keys | None = None,
         tls: ssl.SSLContext | None = None,
         timing: Timing | None = None,
         limits: Limits | None = None,

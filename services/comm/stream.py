@@ -29,7 +29,7 @@ from services.comm.messages import (
     Welcome,
     Withdraw,
 )
-from services.comm.security import require_key, same
+from services.comm.security import UNPROVEN, Keys, require_key, same
 from services.comm.stream_line import STALE_AFTER, Incoming, Inlet, Line, Sink
 from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION, ProtocolError, Side, State
 
@@ -48,7 +48,7 @@ class StreamSender:
     """Sending end of one stream, for the loop of a worker: `send` never blocks, the connection looks after itself.
 
     It connects when there is first something to send, and again at most every 0.1 s when that fails or the receiver is
-    gone. `name` says who sends.
+    gone. `name` says who sends, `receiver` the name of the device that is to receive: another one is sent nothing.
     """
 
     def __init__(
@@ -59,8 +59,9 @@ class StreamSender:
         host: str,
         port: int,
         *,
+        receiver: str,
         ticket: str = "",
-        key: bytes | None = None,
+        key: Keys | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.refusal = ""
@@ -70,6 +71,7 @@ class StreamSender:
         self._hello = Hello(OLDEST_VERSION, NEWEST_VERSION, "stream", name, secrets.token_hex(8))
         self._open = StreamOpen(stream, period, ticket)
         self._address = (host, port)
+        self._receiver = receiver
         self._key = key
         self._clock = clock
         self._line: Line | None = None
@@ -142,7 +144,7 @@ class StreamSender:
     def _connect(self, now: float) -> None:
         host = self._address[0]
         sock = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
-        self._line = Line(sock, Side.CLIENT, self._key)
+        self._line = Line(sock, Side.CLIENT, self._receiver, self._key)
         self._greeted = False
         try:
             self._line.tune()
@@ -171,7 +173,8 @@ class StreamSender:
             self._opened, self._number = self._clock(), 0
             line.write(line.connection.send(self._open))
         elif isinstance(message, Refuse):
-            self.refusal = f"{message.code}: {message.text}"
+            proven = "" if line.connection.proven else f"{UNPROVEN}: "
+            self.refusal = f"{proven}{message.code}: {message.text}"
             self._drop(self._clock() + _RETRY)
             raise ConnectionResetError(self.refusal)
         elif isinstance(message, Bye):
@@ -205,7 +208,7 @@ class StreamReceiver:
         *,
         host: str = "127.0.0.1",
         port: int = 0,
-        key: bytes | None = None,
+        key: Keys | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         require_key(name, host, key)
@@ -257,7 +260,7 @@ class StreamReceiver:
         with contextlib.suppress(OSError):
             for _ in range(_ADMITTED):
                 sock, _ = self._listener.accept()
-                line = Line(sock, Side.SERVER, self._key)
+                line = Line(sock, Side.SERVER, self._name, self._key)
                 line.tune()
                 self._ready.register(sock, select.EPOLLIN)
                 newest = self._guests[sock.fileno()] = _Guest(line, now)

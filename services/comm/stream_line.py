@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 from services.comm.messages import Message, SetPoint, Withdraw
-from services.comm.security import NONCE_BYTES
+from services.comm.security import NONCE_BYTES, Keys
 from services.comm.wire import Connection, Side
 
 STALE_AFTER: Final = 3
@@ -92,12 +92,13 @@ class Incoming:
 
 
 class Line:
-    """One non-blocking connection, either end."""
+    """One non-blocking connection, either end; `receiver` is the name of the end that listens."""
 
-    def __init__(self, sock: socket.socket, side: Side, key: bytes | None) -> None:
+    def __init__(self, sock: socket.socket, side: Side, receiver: str, key: Keys | None) -> None:
         sock.setblocking(False)
         self.sock = sock
-        self.connection = Connection(side, key=key, nonce=secrets.token_bytes(NONCE_BYTES) if key is not None else b"")
+        nonce = secrets.token_bytes(NONCE_BYTES) if key is not None else b""
+        self.connection = Connection(side, receiver, key=key, nonce=nonce)
         self.unsent = b""
 
     def tune(self) -> None:

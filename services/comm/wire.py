@@ -1,12 +1,12 @@
 """One connection of the node protocol as a machine: bytes in, messages out, and the other way round.
 
-A frame is a u32 length (big endian), a body (`codec.py`) and, on a connection with a key, a seal of 16 bytes that the
-length counts. No socket, clock or randomness of its own: the shell passes bytes and the nonce. Nothing but ProtocolError
-leaves it.
+A frame is a u32 length (big endian), a body (`codec.py`) and, on an open connection, a seal of 16 bytes (with a key) or a
+check of 4 bytes (without), which the length counts. No socket, clock or randomness of its own: the shell passes bytes and the
+nonce. Nothing but ProtocolError leaves it.
 
     opening  client: HELLO ->                       server: <- WELCOME or REFUSE
     with a key:      HELLO ->  <- CHALLENGE  PROOF ->        <- WELCOME or REFUSE
-    open     everything else, sealed if there is a key
+    open     everything else, sealed or checked
     closing  BYE or REFUSE was sent: nothing more goes out, what comes in is dropped
     closed   BYE or REFUSE came, or the other side broke the protocol
 """
@@ -32,18 +32,35 @@ from services.comm.codec import (
 )
 from services.comm.frequent import NAME_LENGTH, READERS
 from services.comm.messages import Challenge, Hello, Message, Proof, Refuse, Welcome
-from services.comm.security import NONCE_BYTES, PROOF_BYTES, SEAL_BYTES, Seal, proof, same
+from services.comm.security import (
+    CHECK_BYTES,
+    NONCE_BYTES,
+    PROOF_BYTES,
+    SEAL_BYTES,
+    Check,
+    Keys,
+    Seal,
+    all_keys,
+    check,
+    proof,
+    same,
+)
 from services.comm.turns import LAST, MAY_COME, MAY_GO, NOTHING, OVER, STATES, Phase, Side, State
 
 __all__ = ["NEWEST_VERSION", "OLDEST_VERSION", "Connection", "ProtocolError", "Side", "State", "negotiate"]
 
-OLDEST_VERSION: Final = 1
-NEWEST_VERSION: Final = 1
+OLDEST_VERSION: Final = 2
+NEWEST_VERSION: Final = 2
 """Versions of the protocol that this code speaks."""
 
 _HEADER: Final = 4
 _HEAD: Final = struct.Struct(">IBB")
 """Length, then the first two bytes of the body: its array and the kind."""
+_LENGTH_BITS: Final = 25
+_LENGTH: Final = (1 << _LENGTH_BITS) - 1
+"""The bits of a frame's first word that are its length. On an open connection the other 7 are the length modulo 127, which
+any one changed bit breaks: a length that was made larger must not swallow the frames that follow before it is found out."""
+_MODULUS: Final = 127
 _head_at: Final = _HEAD.unpack_from
 _LARGE: Final = 4096
 _NO_QUICK: Mapping[int, int] = {}
@@ -58,16 +75,21 @@ def negotiate(oldest: int, newest: int) -> int | None:
 class Connection:
     """One end of a connection. `nonce` (32 fresh random bytes) is needed with a `key`.
 
+    `server` is the name of the server: on its own side its name, on the client's the name that the client asks for. HELLO
+    carries it and WELCOME confirms it, both under the proof of the key; a server of another name refuses, and is refused.
     A server sees HELLO only after its sender has proved the key, and then sends WELCOME or REFUSE.
     """
 
-    def __init__(self, side: Side, *, key: bytes | None = None, nonce: bytes = b"") -> None:
+    def __init__(self, side: Side, server: str, *, key: Keys | None = None, nonce: bytes = b"") -> None:
         if key is not None and len(nonce) != NONCE_BYTES:
             raise ValueError(f"a connection with a key needs a nonce of {NONCE_BYTES} bytes")
         self.side = side
         self.version = 0
         """Version agreed on; 0 before WELCOME."""
-        self._key = key
+        self.proven = True
+        """Whether a REFUSE that came is known to be the server's: with a key only if it was sealed."""
+        self._server = server
+        self._keys = all_keys(key)
         self._nonce = nonce
         self._phase = Phase.HELLO
         self._parts: list[bytes] = []
@@ -76,8 +98,8 @@ class Connection:
         self._out = bytearray()
         self._hello: Hello | None = None
         self._transcript = b""
-        self._seal_in: Seal | None = None
-        self._seal_out: Seal | None = None
+        self._seal_in: Seal | Check | None = None
+        self._seal_out: Seal | Check | None = None
         self._seal_bytes = 0
         self._may_come = MAY_COME.get((side, self._phase), NOTHING)
         self._may_go = MAY_GO.get((side, self._phase), NOTHING)
@@ -111,21 +133,18 @@ class Connection:
         """Bytes of a message. Raises ProtocolError if it is too large or may not be sent now; then nothing has changed."""
         if message.KIND not in self._quick_out:
             return self._send_unusual(message)
-        body = encode(message)
-        if self._seal_out is not None:
-            return (len(body) + SEAL_BYTES).to_bytes(_HEADER, "big") + body + self._seal_out.next(body)
-        return len(body).to_bytes(_HEADER, "big") + body
+        return self._frame(encode(message))
 
     def send_all(self, messages: Sequence[Message]) -> bytes:
         """Bytes of messages that may all go and end nothing. Raises as `send`; then nothing has changed."""
         if not self._quick_out.issuperset([message.KIND for message in messages]):
             raise ProtocolError("out_of_turn", "these messages have to be sent one by one")
+        assert self._seal_out is not None
         parts: list[bytes] = []
-        seal, seal_bytes = self._seal_out, self._seal_bytes
+        seal, seal_bytes = self._seal_out.next, self._seal_bytes
         for body in encode_all(messages):
-            parts += (len(body) + seal_bytes).to_bytes(_HEADER, "big"), body
-            if seal is not None:
-                parts.append(seal.next(body))
+            length = len(body) + seal_bytes
+            parts += (length | length % _MODULUS << _LENGTH_BITS).to_bytes(_HEADER, "big"), body, seal(body)
         return b"".join(parts)
 
     def _send_unusual(self, message: Message) -> bytes:
@@ -138,45 +157,60 @@ class Connection:
         return last_word
 
     def refusal(self, refuse: Refuse) -> bytes:
-        """Bytes of the last word to a side that has broken the protocol, sealed if the connection was open."""
-        return self._frame(encode(refuse))
+        """Bytes of the last word to a side that has broken the protocol, sealed as soon as both are known to share a key."""
+        body = encode(refuse)
+        return self._frame(body) if self.version else self._opening_refusal(body)
 
     def _frame(self, body: bytes) -> bytes:
-        if self._seal_out is None:
-            return len(body).to_bytes(_HEADER, "big") + body
-        return (len(body) + SEAL_BYTES).to_bytes(_HEADER, "big") + body + self._seal_out.next(body)
+        assert self._seal_out is not None
+        length = len(body) + self._seal_bytes
+        word = length | length % _MODULUS << _LENGTH_BITS
+        return word.to_bytes(_HEADER, "big") + body + self._seal_out.next(body)
+
+    def _opening_refusal(self, body: bytes) -> bytes:
+        # Proven by the seal that the first frame of the open connection would have had; nothing follows it.
+        return _opening_frame(body if self._seal_out is None else body + self._seal_out.next(body))
 
     def _send_opening(self, message: Message) -> bytes:
         if isinstance(message, Hello):
-            message = replace(message, auth=self._nonce if self._key is not None else b"")
-            body = encode(message)
-            self._transcript = body
+            self._transcript = self._hello_body(message)
             self._enter(Phase.HELLO_SENT)
-        elif isinstance(message, Welcome):
-            body = self._welcome_body(message)
-        else:
-            body = encode(message)
-            self._enter(Phase.CLOSING)
-        data = self._frame(body)
+            return _opening_frame(self._transcript)
         if isinstance(message, Welcome):
+            data = _opening_frame(self._welcome_body(message))
             self._open(message.version)
+            return data
+        data = self._opening_refusal(encode(message))
+        self._enter(Phase.CLOSING)
         return data
 
+    def _hello_body(self, hello: Hello) -> bytes:
+        """HELLO whose `auth` is: bytes of the check (u8), the server that is asked for, the check, which is the nonce, or
+        without a key the CRC-32 of all before it."""
+        end = self._nonce if self._keys else bytes(CHECK_BYTES)
+        body = encode(replace(hello, auth=bytes((len(end),)) + self._server.encode() + end))
+        return body if self._keys else _checked(body)
+
     def _welcome_body(self, welcome: Welcome) -> bytes:
-        if self._key is None:
-            return encode(welcome)
-        # `auth` is the last field, so everything but its 32 bytes is covered without encoding twice on the other side.
+        # `auth` is the last field, so everything but its last bytes is covered without encoding twice on the other side.
+        if not self._keys:
+            return _checked(encode(replace(welcome, auth=bytes(CHECK_BYTES))), self._transcript)
         body = encode(replace(welcome, auth=bytes(PROOF_BYTES)))[:-PROOF_BYTES]
-        return body + proof(self._key, "server", self._transcript + body)
+        return body + proof(self._keys[0], "server", self._transcript + body)
+
+    def _share(self, key: bytes) -> None:
+        """Both sides are known to have this key: all that follows is sealed by it."""
+        self._keys = (key,)
+        labels = ("client to server", "server to client")
+        mine, theirs = labels if self.side is Side.CLIENT else labels[::-1]
+        self._seal_out = Seal(key, mine, self._transcript)
+        self._seal_in = Seal(key, theirs, self._transcript)
 
     def _open(self, version: int) -> None:
         self.version = version
-        if self._key is not None:
-            labels = ("client to server", "server to client")
-            mine, theirs = labels if self.side is Side.CLIENT else labels[::-1]
-            self._seal_out = Seal(self._key, mine, self._transcript)
-            self._seal_in = Seal(self._key, theirs, self._transcript)
-            self._seal_bytes = SEAL_BYTES
+        self._seal_bytes = SEAL_BYTES if self._keys else CHECK_BYTES
+        if not self._keys:
+            self._seal_out = self._seal_in = Check()
         self._enter(Phase.OPEN)
 
     def receive_data(self, data: bytes) -> list[Message]:
@@ -209,12 +243,15 @@ class Connection:
         size, start, longest, seal_bytes = len(data), 0, self._quick_in.get, self._seal_bytes
         last, least = size - _HEAD.size, seal_bytes + 2
         while start < last:
-            length, array, kind = _head_at(data, start)
+            word, array, kind = _head_at(data, start)
+            length = word & _LENGTH
             body = start + _HEADER
             end = body + length
             if end > size or not least <= length <= longest(kind, 0) or array & 0xF0 != 0x90:
                 break
-            part = self._unsealed(data, body, end) if seal_bytes else data[body:end]
+            if word >> _LENGTH_BITS != length % _MODULUS:
+                break
+            part = self._unsealed(data, body, end)
             message = None
             if kind in READERS and length <= UNCOUNTED:
                 # As `decode_kind`, which would be one more call for each of a hundred thousand frames a second.
@@ -238,45 +275,55 @@ class Connection:
             self._have = len(data) - start
 
     def _unsealed(self, data: bytes, start: int, end: int) -> bytes | memoryview:
-        """The body of a sealed frame, which lies with its seal at `start` to `end`."""
+        """The body of a frame of an open connection, which lies with its seal or check at `start` to `end`."""
         assert self._seal_in is not None
-        middle = end - SEAL_BYTES
+        middle = end - self._seal_bytes
         # A large body is not copied again to be taken apart.
         body = memoryview(data)[start:middle] if end - start > _LARGE else data[start:middle]
         if not same(data[middle:end], self._seal_in.next(body)):
-            raise ProtocolError("bad_seal", "a frame was changed, repeated, lost or made without the key")
+            if self._keys:
+                raise ProtocolError("bad_seal", "a frame was changed, repeated, lost or made without the key")
+            raise ProtocolError("bad_check", "a frame was changed on its way, or made without its check")
         return body
 
     def _frame_end(self, data: bytes, start: int) -> int:
         """Where the frame that begins at `start` ends; 0 if it is not all there. Refuses a bad one as early as it can."""
         body = start + _HEADER
         self._need = _HEADER + 2
-        if len(data) < body + 2:
-            if len(data) >= body and int.from_bytes(data[start:body], "big") < 2:
-                raise ProtocolError("malformed", "a frame without a message")
+        if len(data) < body:
             return 0
         length = int.from_bytes(data[start:body], "big")
         sealed = self._seal_bytes
+        if sealed:
+            word, length = length, length & _LENGTH
+            if word >> _LENGTH_BITS != length % _MODULUS:
+                raise ProtocolError("bad_check", "the length of a frame was changed on its way, or has no check")
         if length < 2 + sealed:
             raise ProtocolError("malformed", f"a frame of {length} bytes")
+        if len(data) < body + 2:
+            return 0
         kind = kind_of(data[body : body + 2])
         if kind not in self._may_come:
             raise ProtocolError("out_of_turn", f"kind {kind} cannot come while {self._phase.value}")
-        if length > LIMITS[kind] + sealed:
+        # A refusal of the opening may have a seal as well.
+        longest = LIMITS[kind] + (SEAL_BYTES if self._phase is Phase.PROVED else sealed)
+        if length > longest:
             raise ProtocolError("too_large", f"kind {kind}: {length} bytes are above the limit of {LIMITS[kind]}")
         self._need = _HEADER + length
         return body + length if len(data) >= body + length else 0
 
     def _take(self, data: bytes, start: int, end: int) -> Message | None:
-        body = data[start:end] if self._seal_in is None else self._unsealed(data, start, end)
-        message = decode(body)
         if self._phase is not Phase.OPEN:
-            return self._take_opening(message, bytes(body))
+            return self._take_opening(data[start:end])
+        message = decode(self._unsealed(data, start, end))
         if message.KIND in LAST:
             self._enter(Phase.CLOSED)
         return message
 
-    def _take_opening(self, message: Message, body: bytes) -> Message | None:
+    def _take_opening(self, body: bytes) -> Message | None:
+        if self._phase is Phase.PROVED and kind_of(body) == Refuse.KIND:
+            body = self._refusal_body(body)
+        message = decode(body)
         if isinstance(message, Hello):
             return self._take_hello(message, body)
         if isinstance(message, Challenge):
@@ -287,8 +334,18 @@ class Connection:
         if isinstance(message, Welcome):
             self._take_welcome(message, body)
             return message
+        self.proven = not self._keys or (self.proven and self._phase is Phase.PROVED)
         self._enter(Phase.CLOSED)
         return message
+
+    def _refusal_body(self, body: bytes) -> bytes:
+        """The body of a refusal in answer to our proof, which is proven if the server has sealed it."""
+        for key in self._keys:
+            seal = Seal(key, "server to client", self._transcript)
+            if same(body[-SEAL_BYTES:], seal.next(body[:-SEAL_BYTES])):
+                return body[:-SEAL_BYTES]
+        self.proven = False
+        return body
 
     def _take_hello(self, hello: Hello, body: bytes) -> Hello | None:
         if negotiate(hello.oldest_version, hello.newest_version) is None:
@@ -298,44 +355,98 @@ class Connection:
                 "version", f"versions {asked} are asked for, {spoken} are spoken here: update the older side"
             )
         self._transcript = body
-        if self._key is None:
-            if hello.auth:
+        wanted, keyed = _wanted(hello, body)
+        if not self._keys:
+            if keyed:
                 raise ProtocolError(
                     "no_key_here", "this side has no key: give it the same key file, or take yours away"
                 )
             self._enter(Phase.DECIDING)
+            self._refuse_another(wanted)
             return hello
-        if len(hello.auth) != NONCE_BYTES:
+        if not keyed:
             raise ProtocolError("key_needed", "this side asks for a key: give the other side the same key file")
         self._hello = hello
         challenge = encode(Challenge(self._nonce))
         self._transcript += challenge
-        self._out += self._frame(challenge)
+        self._out += _opening_frame(challenge)
         self._enter(Phase.CHALLENGED)
         return None
 
+    def _refuse_another(self, wanted: str) -> None:
+        if wanted != self._server:
+            raise _wrong_node(self._server, wanted)
+
     def _take_challenge(self, challenge: Challenge, body: bytes) -> None:
-        if self._key is None:
+        if not self._keys:
             raise ProtocolError("key_needed", "the server asks for a key: give this side the same key file")
         if len(challenge.auth) != NONCE_BYTES:
             raise ProtocolError("malformed", f"a nonce of {len(challenge.auth)} bytes")
         self._transcript += body
-        self._out += self._frame(encode(Proof(proof(self._key, "client", self._transcript))))
+        proofs = b"".join([proof(key, "client", self._transcript) for key in self._keys])
+        self._out += _opening_frame(encode(Proof(proofs)))
         self._enter(Phase.PROVED)
 
     def _take_proof(self, given: Proof) -> Hello | None:
-        if self._key is None or not same(given.auth, proof(self._key, "client", self._transcript)):
+        auth = given.auth
+        proofs = [auth[n : n + PROOF_BYTES] for n in range(0, len(auth), PROOF_BYTES)]
+        for key in self._keys:
+            expected = proof(key, "client", self._transcript)
+            if any(same(one, expected) for one in proofs):
+                break
+        else:
             raise ProtocolError("wrong_key", "the client's key is not this side's key: use the same key file")
+        self._share(key)
         self._enter(Phase.DECIDING)
+        assert self._hello is not None
+        self._refuse_another(_wanted(self._hello, b"")[0])
         return self._hello
 
     def _take_welcome(self, welcome: Welcome, body: bytes) -> None:
-        if self._key is not None:
+        if self._keys:
             if self._phase is not Phase.PROVED:
                 raise ProtocolError("no_key_there", "the server did not ask for the key: give it the same key file")
-            expected = proof(self._key, "server", self._transcript + body[:-PROOF_BYTES])
-            if not same(welcome.auth, expected):
+            covered = self._transcript + body[:-PROOF_BYTES]
+            for key in self._keys:
+                if same(welcome.auth, proof(key, "server", covered)):
+                    break
+            else:
                 raise ProtocolError("wrong_key", "the server's key is not this side's key: use the same key file")
+            self._share(key)
+        elif welcome.auth != check(body[:-CHECK_BYTES], self._transcript):
+            raise ProtocolError("bad_check", "HELLO or WELCOME was changed on its way")
         if not OLDEST_VERSION <= welcome.version <= NEWEST_VERSION:
             raise ProtocolError("version", f"the server chose version {welcome.version}, which was not offered")
+        if welcome.name != self._server:
+            raise _wrong_node(welcome.name, self._server)
         self._open(welcome.version)
+
+
+def _opening_frame(body: bytes) -> bytes:
+    """As in every version of the protocol, so that an older side understands why it is refused."""
+    return len(body).to_bytes(_HEADER, "big") + body
+
+
+def _checked(body: bytes, before: bytes = b"") -> bytes:
+    """A body that ends with room for its check, with the check."""
+    body = body[:-CHECK_BYTES]
+    return body + check(body, before)
+
+
+def _wanted(hello: Hello, body: bytes) -> tuple[str, bool]:
+    """The server that a HELLO asks for, and whether its sender has a key. Raises ProtocolError."""
+    auth = hello.auth
+    size = auth[0] if auth else 0
+    if size not in (CHECK_BYTES, NONCE_BYTES) or len(auth) < 1 + size:
+        raise ProtocolError("malformed", "HELLO: auth is not the wanted name with a nonce or a check")
+    if size == CHECK_BYTES and body and auth[-size:] != check(body[:-size]):
+        raise ProtocolError("bad_check", "HELLO was changed on its way")
+    try:
+        return auth[1:-size].decode(), size == NONCE_BYTES
+    except UnicodeDecodeError:
+        raise ProtocolError("malformed", "HELLO: the wanted name is not UTF-8") from None
+
+
+def _wrong_node(here: str, wanted: str) -> ProtocolError:
+    remedy = f"check host and port of {wanted} in services.toml"
+    return ProtocolError("wrong_node", f"this is {here}, {wanted or 'nobody'} was asked for: {remedy}")

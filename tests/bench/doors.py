@@ -56,6 +56,48 @@ async def times(client: Client, until: Callable[[int], bool]) -> list[float]:
     return took
 
 
+HEAVY = """
+import asyncio, sys
+from services.comm import messages as m
+from services.comm.caller import Caller
+from services.comm.client import Client
+from services.comm.wire import NEWEST_VERSION as V
+
+PAYLOADS = [
+    [[]] * 19_900, [{}] * 19_900, [[None] * 5] * 19_900, [None] * 130_000, [1.5] * 110_000, ["x"] * 130_000,
+    bytes(1_900_000), "x" * 1_900_000, {str(n): n for n in range(21_000)}, [[None] * 40] * 99_000,
+]
+
+async def main():
+    caller = Caller("vision", m.Hello(V, V, "client", "heavy", "h1"), auto_ack=True)
+    client = Client(sys.argv[1], int(sys.argv[2]), caller, key=bytes.fromhex(sys.argv[3]))
+    client.start()
+    assert await client.connected(20.0)
+    print("ready", flush=True)
+    for _ in range(3):
+        for payload in PAYLOADS:
+            outcomes = await asyncio.gather(*(client.call("echo", {"v": payload}) for _ in range(2)))
+            print(len(str(payload)[:9]), outcomes[0].status, outcomes[0].cause, flush=True)
+    await client.close()
+
+asyncio.run(main())
+"""
+
+
+@contextlib.asynccontextmanager
+async def heavy(server: Victim) -> AsyncIterator[None]:
+    """One that has the key calls with what takes longest to read, two at a time, from a process of its own."""
+    command = [sys.executable, "-c", HEAVY, server.host, str(server.port), KEY.hex()]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}
+    process = await asyncio.create_subprocess_exec(*command, env=environment, stdout=asyncio.subprocess.PIPE)
+    assert process.stdout is not None
+    await process.stdout.readline()
+    yield
+    await process.communicate()
+    if process.returncode:
+        raise RuntimeError("the heavy caller failed")
+
+
 @contextlib.asynccontextmanager
 async def nothing(server: Victim) -> AsyncIterator[None]:
     """No attack."""
@@ -118,6 +160,7 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", metavar="FILE", type=Path, help="write the figures as JSON")
+    parser.add_argument("--only", metavar="TEXT", default="", help="rows whose name has this text")
     options = parser.parse_args()
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
@@ -131,8 +174,9 @@ def main() -> None:
             ("10,000, TLS", connections, {"folder": folder}),
             ("random bytes", noise, {}),
             ("flood of heartbeats", flood, {}),
+            ("heavy calls, shared key", heavy, {"key": KEY.hex()}),
         ]
-        for name, attack, settings in cases:
+        for name, attack, settings in [case for case in cases if options.only in case[0]]:
             server = Victim(settings)
             try:
                 rows[name] = asyncio.run(under(attack, server))

@@ -115,7 +115,7 @@ class Bench:
     async def wire(self, places: Directory) -> None:
         """The same calls without a coordinator, one after the other."""
         node = places.nodes["far"]
-        hello = Hello(1, 99, "coordinator", f"wire{self._number}", "b", 1, places.hash)
+        hello = Hello(2, 99, "coordinator", f"wire{self._number}", "b", 1, places.hash)
         client = Client(node.host, node.port, Caller("far", hello))
         client.start()
         if not await client.connected(10.0):

@@ -104,7 +104,7 @@ async def measure(folder: Path, stops: int, whole: int) -> dict[str, Any]:
     """All figures."""
     directory = cell_in(folder)
     name = secrets.token_hex(4)
-    hello = Hello(1, 1, "coordinator", "coordinator", name, 1, directory.hash)
+    hello = Hello(2, 2, "coordinator", "coordinator", name, 1, directory.hash)
     async with Supervisor(local_programs(directory), folder / "logs", respawn=False):
         with ear_on(directory) as ear:
             line = EmergencyLine(directory, "motion", Credentials())

@@ -235,7 +235,7 @@ class Petrobot(AsyncContender):
         return self.server.address[1]
 
     async def open(self, port: int) -> None:
-        caller = Caller("node", Hello(1, 1, "client", "bench", "b"))
+        caller = Caller("node", Hello(2, 2, "client", "bench", "b"))
         self.client = Client(HOST, port, caller, key=self.key)
         self.client.start()
         if not await self.client.connected(5.0):

@@ -30,7 +30,7 @@ _RECORD = struct.Struct("9d")
 
 def send_both(raw_port: int, stream_port: int, rate: int, seconds: float) -> None:
     """Send set points that say when they were due and when they were sent."""
-    sender = StreamSender("bench", "point", 1.0 / rate, HOST, stream_port)
+    sender = StreamSender("bench", "point", 1.0 / rate, HOST, stream_port, receiver="bench")
     while not sender.up:
         sender.advance()
         time.sleep(0.001)

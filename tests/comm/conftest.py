@@ -18,6 +18,7 @@ from tests.waiting import Limit
 from .ends import Node
 
 KEY = bytes(range(32))
+SERVER = "vision"
 NONCES = {Side.CLIENT: b"c" * 32, Side.SERVER: b"s" * 32}
 
 _durations = st.floats(0.0, 1e9)
@@ -70,14 +71,14 @@ def plain_data() -> st.SearchStrategy[Any]:
 
 def new_pair(key: bytes | None) -> tuple[Connection, Connection]:
     client, server = (
-        Connection(side, key=key, nonce=NONCES[side] if key else b"") for side in (Side.CLIENT, Side.SERVER)
+        Connection(side, SERVER, key=key, nonce=NONCES[side] if key else b"") for side in (Side.CLIENT, Side.SERVER)
     )
     return client, server
 
 
 def greet(client: Connection, server: Connection) -> bytes:
     """Lead both to open; gives all that the client sent."""
-    said = client.send(Hello(1, 1, "coordinator", "coord", "b0", 1))
+    said = client.send(Hello(2, 2, "coordinator", "coord", "b0", 1))
     hello = server.receive_data(said)
     limit = Limit("the client's hello", steps=10)
     while not hello and limit.left():
@@ -86,7 +87,7 @@ def greet(client: Connection, server: Connection) -> bytes:
         said += proof
         hello = server.receive_data(proof)
     assert [type(message) for message in hello] == [Hello]
-    client.receive_data(server.send(Welcome(1, "vision", "b1")))
+    client.receive_data(server.send(Welcome(2, "vision", "b1")))
     return said
 
 

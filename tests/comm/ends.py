@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import zlib
 from collections.abc import Callable
 from typing import Any
 
@@ -16,9 +17,10 @@ from services.comm.client import Client
 from services.comm.codec import encode
 from services.comm.link import Link, Timing
 from services.comm.server import Server
+from services.comm.wire import Connection, Side
 
 QUICK = Timing(heartbeat=0.05, silence=0.2, handshake=0.3, backoff=(0.01, 0.05))
-HELLO = m.Hello(1, 1, "coordinator", "coord", "c1", 1)
+HELLO = m.Hello(2, 2, "coordinator", "coord", "c1", 1)
 
 
 def _echo(now: float, call: m.Call) -> m.Outcome:
@@ -106,10 +108,28 @@ def _and_then(method: Callable[..., Any], do: Callable[[], None]) -> Callable[..
     return both
 
 
-def frame(message: m.Message) -> bytes:
-    """A message as it goes over the wire without a key."""
-    body = encode(message)
-    return len(body).to_bytes(4, "big") + body
+def frame(message: m.Message, server: str = "motion") -> bytes:
+    """A message as it goes over the wire to `server` without a key: HELLO of the opening, all others of an open connection."""
+    if isinstance(message, m.Hello):
+        return Connection(Side.CLIENT, server).send(message)
+    return framed(encode(message))
+
+
+def framed(body: bytes) -> bytes:
+    """A body as a frame of an open connection without a key."""
+    return head(len(body) + 4) + body + zlib.crc32(body).to_bytes(4, "big")
+
+
+def head(length: int) -> bytes:
+    """The first four bytes of a frame of an open connection."""
+    return (length | length % 127 << 25).to_bytes(4, "big")
+
+
+def welcome(hello: bytes, name: str = "motion") -> bytes:
+    """What a server of this name answers to these bytes of a HELLO."""
+    server = Connection(Side.SERVER, name)
+    server.receive_data(hello)
+    return server.send(m.Welcome(2, name, "n1", ("echo",)))
 
 
 async def read_all(reader: asyncio.StreamReader) -> bytes:

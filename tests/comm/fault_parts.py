@@ -1,6 +1,6 @@
 """Other processes that are killed, frozen or cut off: a node, a sender of set points, and the cable between.
 
-python -m tests.comm.fault_parts node            # prints its port
+python -m tests.comm.fault_parts node [PORT BOOT]      # prints its port
 python -m tests.comm.fault_parts sender PORT PERIOD
 """
 
@@ -42,7 +42,7 @@ class Cable:
     """Carries bytes between who connects to `port` and the other end, until it is cut."""
 
     def __init__(self, far: int) -> None:
-        self._far = far
+        self.far = far
         self._listener = socket.create_server((HOST, 0))
         self.port = int(self._listener.getsockname()[1])
         self._wake, self._stop = socket.socketpair()
@@ -80,7 +80,7 @@ class Cable:
     def _join(self, pairs: dict[socket.socket, socket.socket]) -> None:
         near, _ = self._listener.accept()
         try:
-            far = socket.create_connection((HOST, self._far))
+            far = socket.create_connection((HOST, self.far))
         except OSError:
             near.close()  # nobody is there any more
         else:
@@ -126,7 +126,7 @@ def first_line(process: subprocess.Popen[str]) -> str:
     return process.stdout.readline().strip()
 
 
-async def be_node() -> None:
+async def be_node(port: int, boot: str) -> None:
     """A node whose action `move` goes on until it is cancelled."""
 
     def obey(now: float, orders: list[Order]) -> None:
@@ -134,16 +134,16 @@ async def be_node() -> None:
             if isinstance(order, CancelRun):
                 callee.finish(now, order.id, "error", cause="cancelled", text="it was told to stop")
 
-    callee = Callee("motion", "n1", {"move": Offer()})
+    callee = Callee("motion", boot, {"move": Offer()})
     server = Server(callee, on_orders=obey)
-    await server.start(HOST, 0)
+    await server.start(HOST, port)
     print(server.address[1], flush=True)
     await asyncio.Event().wait()
 
 
 def be_sender(port: int, period: float) -> None:
     """Sends one set point a period by absolute deadline, and stands by it: the number of periods since the beginning."""
-    sender = StreamSender("vision", STREAM, period, HOST, port)
+    sender = StreamSender("vision", STREAM, period, HOST, port, receiver="motion")
     due, number = time.monotonic(), 0
     while True:
         number += 1
@@ -155,6 +155,7 @@ def be_sender(port: int, period: float) -> None:
 
 if __name__ == "__main__":
     if sys.argv[1] == "node":
-        asyncio.run(be_node())
+        port, boot = sys.argv[2:] or ("0", "n1")
+        asyncio.run(be_node(int(port), boot))
     else:
         be_sender(int(sys.argv[2]), float(sys.argv[3]))

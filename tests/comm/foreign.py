@@ -11,6 +11,7 @@ import secrets
 import socket
 import struct
 import time
+import zlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -107,18 +108,29 @@ class Foreign:
         self.seal_out = self.seal_in = b""
         self.sent = self.heard = 0
         """Frames sealed in each direction."""
+        self.is_open = False
+        self.proven = False
+        """Whether the refusal of the opening was sealed."""
         self.skipped: list[list[Any]] = []
         """What came while something else was waited for."""
 
     # --- frames
 
     def frame(self, body: bytes) -> bytes:
-        """A body with its length, and with its seal once the connection is open and has a key."""
-        seal = b""
+        """A body with its length, and with its seal or check once the connection is open."""
+        if not self.is_open:
+            return struct.pack(">I", len(body)) + body
         if self.seal_out:
-            seal = hmac.digest(self.seal_out, struct.pack(">Q", self.sent) + body, "sha256")[:16]
+            end = hmac.digest(self.seal_out, struct.pack(">Q", self.sent) + body, "sha256")[:16]
             self.sent += 1
-        return struct.pack(">I", len(body) + len(seal)) + body + seal
+        else:
+            end = struct.pack(">I", zlib.crc32(body))
+        return self.head(len(body) + len(end)) + body + end
+
+    @staticmethod
+    def head(length: int) -> bytes:
+        """The first four bytes of a frame of an open connection."""
+        return struct.pack(">I", length % 127 << 25 | length)
 
     def say(self, *message: Any) -> None:
         """Send a message: kind and fields."""
@@ -138,9 +150,17 @@ class Foreign:
         return data
 
     def body(self) -> bytes:
-        """The next frame's body, its seal checked."""
-        body = self._exactly(int.from_bytes(self._exactly(4), "big"))
-        if self.seal_in:
+        """The next frame's body, its seal or check looked at."""
+        word = int.from_bytes(self._exactly(4), "big")
+        if not self.is_open:
+            return self._exactly(word)
+        length = word & 0x1FFFFFF
+        assert word >> 25 == length % 127
+        body = self._exactly(length)
+        if not self.seal_in:
+            body, end = body[:-4], body[-4:]
+            assert end == struct.pack(">I", zlib.crc32(body))
+        else:
             body, seal = body[:-16], body[-16:]
             assert seal == hmac.digest(self.seal_in, struct.pack(">Q", self.heard) + body, "sha256")[:16]
             self.heard += 1
@@ -178,25 +198,40 @@ class Foreign:
         boot: str = "f1",
         epoch: int = 0,
         directory: str = "",
-        versions: Sequence[int] = (1, 1),
+        versions: Sequence[int] = (2, 2),
+        node: str = "hub",
     ) -> list[Any]:
         """HELLO to WELCOME; gives WELCOME, or the REFUSE that came in its place."""
-        auth = secrets.token_bytes(32) if self.key is not None else b""
+        check = secrets.token_bytes(32) if self.key is not None else bytes(4)
+        auth = bytes([len(check)]) + node.encode() + check
         hello = pack([HELLO, *versions, role, name, boot, epoch, directory, auth])
+        if self.key is None:
+            hello = hello[:-4] + struct.pack(">I", zlib.crc32(hello[:-4]))
         self.raw(self.frame(hello))
         body = self.body()
-        if self.key is None or body[1] == REFUSE:
+        if body[1] == REFUSE:
             return unpack(body)
+        if self.key is None and body[1] == WELCOME:
+            message = unpack(body)
+            assert message[7] == struct.pack(">I", zlib.crc32(hello + body[:-4])), "HELLO or WELCOME was changed"
+            assert message[2] == node
+            self.is_open = True
+            return message
         assert body[1] == CHALLENGE and len(unpack(body)[1]) == 32
         transcript = hello + body
         self.say(PROOF, self._hmac(b"client\0" + transcript))
         body = self.body()
-        message = unpack(body)
-        if message[0] == WELCOME:
+        if body[1] == WELCOME:
+            message = unpack(body)
             assert message[7] == self._hmac(b"server\0" + transcript + body[:-32]), "the node does not know the key"
+            assert message[2] == node
             self.seal_out = self._hmac(b"client to server\0" + transcript)
             self.seal_in = self._hmac(b"server to client\0" + transcript)
-        return message
+            self.is_open = True
+            return message
+        seal = hmac.digest(self._hmac(b"server to client\0" + transcript), bytes(8) + body[:-16], "sha256")[:16]
+        self.proven = body.endswith(seal)
+        return unpack(body[:-16] if self.proven else body)
 
     def _hmac(self, data: bytes) -> bytes:
         assert self.key is not None

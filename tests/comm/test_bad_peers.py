@@ -16,7 +16,7 @@ from services.comm.link import Timing
 from services.comm.messages import Executed
 from tests.waiting import Limit
 
-from .ends import HELLO, Coordinator, Node, frame, read_all, until
+from .ends import HELLO, Coordinator, Node, frame, read_all, until, welcome
 
 
 async def test_a_peer_that_is_silent_is_cut(open_node: Node) -> None:
@@ -31,8 +31,7 @@ async def test_a_peer_that_is_silent_is_cut(open_node: Node) -> None:
 
 async def test_a_node_that_is_silent_is_lost_at_once(open_node: Node) -> None:
     async def frozen(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        await reader.read(1)
-        writer.write(frame(m.Welcome(1, "motion", "n1", ("echo",))))
+        writer.write(welcome(await reader.read(1000)))
         await read_all(reader)
         writer.close()
 
@@ -125,9 +124,15 @@ async def _served_under_attack(frames: int) -> None:
     await attack
     await until(lambda: node.server.connected == ("coord",) and len(node.server._all) == 1)
     assert not any(isinstance(notice, PeerLost) for notice in coordinator.notices)
-    assert served and {"malformed", "unknown_kind", "too_large", "out_of_turn", "version", "no_key_here"} >= set(
-        node.server.faults
-    )
+    assert served and {
+        "malformed",
+        "unknown_kind",
+        "too_large",
+        "out_of_turn",
+        "version",
+        "no_key_here",
+        "bad_check",
+    } >= set(node.server.faults)
     assert sum(node.server.faults.values()) > frames // 4
     assert len(node.server.callee._peers._peers) <= 300
     await coordinator.client.close()

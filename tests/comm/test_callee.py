@@ -11,7 +11,7 @@ from services.comm.callee import Callee, CancelRun, Commanded, Keeping, Offer, S
 from services.comm.messages import Executed
 from services.comm.results import FinishedIds
 
-COORD = m.Hello(1, 1, "coordinator", "coord", "c1", 3, "d1")
+COORD = m.Hello(2, 2, "coordinator", "coord", "c1", 3, "d1")
 
 
 def _failing(now: float, call: m.Call) -> m.Outcome:
@@ -96,7 +96,7 @@ def test_a_local_service_is_not_even_shown_to_another_host() -> None:
 
 
 def test_a_refused_call_stays_refused() -> None:
-    callee = _callee(COORD, m.Hello(1, 1, "coordinator", "other", "o1"))
+    callee = _callee(COORD, m.Hello(2, 2, "coordinator", "other", "o1"))
     callee.receive(0.0, "coord", m.Call("1", "move", epoch=3))
     callee.receive(0.1, "other", m.Call("2", "move"))
     callee.finish(1.0, "1", "success")
@@ -116,8 +116,8 @@ def test_busy_is_said_by_the_runner() -> None:
 
 
 def test_a_device_takes_orders_from_the_holder_of_its_lease_alone() -> None:
-    other = m.Hello(1, 1, "coordinator", "other", "o1")
-    callee = _callee(COORD, other, m.Hello(1, 1, "node", "vision", "v1"))
+    other = m.Hello(2, 2, "coordinator", "other", "o1")
+    callee = _callee(COORD, other, m.Hello(2, 2, "node", "vision", "v1"))
     callee.receive(0.0, "coord", m.Call("1", "move", epoch=3))
     _said(callee)
     callee.receive(0.1, "vision", m.Call("2", "move"))
@@ -131,7 +131,7 @@ def test_a_device_takes_orders_from_the_holder_of_its_lease_alone() -> None:
 
 
 def test_a_lease_outlives_a_short_break_of_the_link() -> None:
-    callee = _callee(COORD, m.Hello(1, 1, "coordinator", "other", "o1"))
+    callee = _callee(COORD, m.Hello(2, 2, "coordinator", "other", "o1"))
     callee.receive(0.0, "coord", m.Call("1", "move", epoch=3))
     callee.finish(0.5, "1", "success")
     callee.link_down(1.0, "coord")
@@ -143,7 +143,7 @@ def test_a_lease_outlives_a_short_break_of_the_link() -> None:
 
 
 def test_an_id_of_another_caller_is_not_answered_with_his_result() -> None:
-    callee = _callee(COORD, m.Hello(1, 1, "coordinator", "other", "o1"))
+    callee = _callee(COORD, m.Hello(2, 2, "coordinator", "other", "o1"))
     callee.receive(0.0, "coord", m.Call("1", "get", epoch=3))
     _said(callee)
     callee.receive(0.1, "other", m.Call("1", "get"))
@@ -221,7 +221,7 @@ def test_a_cancel_that_overtakes_its_call_keeps_it_from_beginning() -> None:
 
 
 def test_another_caller_cannot_cancel_a_run() -> None:
-    callee = _callee(COORD, m.Hello(1, 1, "client", "other", "o1"))
+    callee = _callee(COORD, m.Hello(2, 2, "client", "other", "o1"))
     callee.receive(0.0, "coord", m.Call("1", "track", epoch=3))
     callee.orders()
     callee.receive(0.1, "other", m.Cancel("1"))
@@ -231,13 +231,13 @@ def test_another_caller_cannot_cancel_a_run() -> None:
 @pytest.mark.parametrize(
     ("hello", "code"),
     [
-        (m.Hello(2, 3, "coordinator", "coord", "c9", 9), "version"),
-        (m.Hello(1, 1, "coordinator", "coord", "c0", 2), "old_epoch"),
-        (m.Hello(1, 1, "coordinator", "coord", "c9", 3), "name_taken"),
-        (m.Hello(1, 1, "coordinator", "new", "c9", 1, "d2"), "directory"),
-        (m.Hello(1, 1, "coordinator", "coord", "c1", 3), ""),
-        (m.Hello(1, 1, "coordinator", "coord", "c9", 4), ""),
-        (m.Hello(1, 1, "coordinator", "new", "c9", 1, ""), ""),
+        (m.Hello(3, 4, "coordinator", "coord", "c9", 9), "version"),
+        (m.Hello(2, 2, "coordinator", "coord", "c0", 2), "old_epoch"),
+        (m.Hello(2, 2, "coordinator", "coord", "c9", 3), "name_taken"),
+        (m.Hello(2, 2, "coordinator", "new", "c9", 1, "d2"), "directory"),
+        (m.Hello(2, 2, "coordinator", "coord", "c1", 3), ""),
+        (m.Hello(2, 2, "coordinator", "coord", "c9", 4), ""),
+        (m.Hello(2, 2, "coordinator", "new", "c9", 1, ""), ""),
     ],
 )
 def test_who_is_welcome(hello: m.Hello, code: str) -> None:
@@ -250,7 +250,7 @@ def test_who_is_welcome(hello: m.Hello, code: str) -> None:
 
 def test_another_directory_may_be_allowed() -> None:
     callee = Callee("motion", "n1", OFFERS, directory="d1", any_directory=True)
-    welcome = callee.link_up(0.0, "new", m.Hello(1, 1, "client", "new", "c", 0, "d2"))
+    welcome = callee.link_up(0.0, "new", m.Hello(2, 2, "client", "new", "c", 0, "d2"))
     assert isinstance(welcome, m.Welcome) and welcome.directory == "d1", "it still says which one it has"
 
 
@@ -373,7 +373,7 @@ def test_callers_that_came_and_went_do_not_fill_the_memory(role: str) -> None:
     callee = Callee("motion", "n1", OFFERS)
     for n in range(2_000):
         name = f"client{n}"
-        assert isinstance(callee.link_up(0.0, name, m.Hello(1, 1, role, name, "b")), m.Welcome)
+        assert isinstance(callee.link_up(0.0, name, m.Hello(2, 2, role, name, "b")), m.Welcome)
         callee.receive(0.0, name, m.Subscribe(("tick",)))
         callee.link_down(0.0, name)
     assert len(callee._peers._peers) <= 257 and len(callee.events._listeners) <= 257
@@ -420,3 +420,38 @@ def test_a_held_run_is_still_an_orphan_without_its_caller() -> None:
     callee.link_down(1.0, "coord")
     callee.advance(2.0)
     assert callee.orders() == [CancelRun("1", "orphan")]
+
+
+def test_a_repeated_command_is_not_carried_out_again() -> None:
+    """While it waits for its answer nothing happens; afterwards the same answer is said; another caller's id is his own."""
+    callee = _callee(COORD, m.Hello(2, 2, "client", "other", "o1"))
+    callee.messages()
+    stop = m.Command("k1", "stop", "arm")
+    for _ in range(3):
+        callee.receive(0.0, "coord", stop)
+    assert callee.orders() == [Commanded(stop, "coord")] and callee.messages() == []
+    callee.answer(0.1, "k1", True, {"answers": {"arm": "stopped"}})
+    (said,) = callee.messages()
+    callee.receive(0.2, "coord", stop)
+    assert callee.orders() == [] and callee.messages() == [said]
+    callee.receive(0.3, "other", stop)
+    [(peer, answer)] = callee.messages()
+    assert peer == "other" and isinstance(answer, m.Answer) and answer.data["cause"] == "id_taken"
+    for number in range(1_000):
+        callee.receive(1.0, "coord", m.Command(f"more {number}", "status"))
+        callee.answer(1.0, f"more {number}", True)
+    assert len(callee._answers) <= 64 and not callee._commands
+
+
+def test_an_offer_for_some_roles_is_refused_to_others() -> None:
+    """Such as the ticket of a set-point stream: for nodes and coordinators, not for whoever may only look."""
+    offers = {"stream:points": Offer(inline=lambda _, call: m.Outcome(call.id, "success"), roles=frozenset(("node",)))}
+    callee = Callee("motion", "n1", offers)
+    for role, cause in (("client", "not_for_role"), ("stream", "not_for_role"), ("node", "")):
+        callee.link_up(0.0, role, m.Hello(2, 2, role, role, "b"))
+        callee.messages()
+        assert (callee.answer_inline(0.0, role, m.Call(f"{role}/1", "stream:points")) is None) is bool(cause)
+        callee.receive(0.0, role, m.Call(f"{role}/2", "stream:points"))
+        [(_, outcome)] = callee.messages()
+        assert isinstance(outcome, m.Outcome)
+        assert (outcome.cause, outcome.executed) == (cause, m.Executed.NO if cause else m.Executed.YES)

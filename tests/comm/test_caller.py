@@ -38,12 +38,12 @@ class _Waiter:
         self.told.append(outcome)
 
 
-HELLO = m.Hello(1, 1, "coordinator", "coord", "c1", 3)
+HELLO = m.Hello(2, 2, "coordinator", "coord", "c1", 3)
 CALL = m.Call("1", "move", {"to": (1, 2)}, 2.0)
 
 
 def _welcome(boot: str = "n1", runs: tuple[str, ...] = ()) -> m.Welcome:
-    return m.Welcome(1, "motion", boot, ("move",), runs)
+    return m.Welcome(2, "motion", boot, ("move",), runs)
 
 
 def _caller(*, up: bool = True, auto_ack: bool = False) -> Caller:

@@ -56,7 +56,7 @@ class World:
         return Callee("motion", f"n{self.boot}", offers, keeping=Keeping(results=3.0, result_count=4, id_groups=2))
 
     def _new_caller(self) -> Caller:
-        return Caller("motion", m.Hello(1, 1, "coordinator", COORD, f"c{self.epoch}", self.epoch))
+        return Caller("motion", m.Hello(2, 2, "coordinator", COORD, f"c{self.epoch}", self.epoch))
 
     def _inline(self, now: float, call: m.Call) -> m.Outcome:
         self.started[call.id] += 1

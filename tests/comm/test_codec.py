@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from services.comm import codec
 from services.comm import messages as m
 from services.comm.canbus import Frame
-from services.comm.codec import LIMITS, MAX_CONTAINERS, ProtocolError, decode, encode
+from services.comm.codec import LIMITS, MAX_CONTAINERS, MIB, ProtocolError, decode, encode
 from services.comm.frequent import NAME_LENGTH
 from services.comm.messages import Executed
 from services.comm.party import Envelope, Posted
@@ -275,6 +275,26 @@ def test_many_empty_containers_do_not_fill_the_memory(container: bytes) -> None:
     head = b"\x94\x04\xa1c\xa1s\x81\xa1a\xdd" + count.to_bytes(4, "big")
     with pytest.raises(ProtocolError, match="arrays and maps"):
         decode(head + container * count)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [[[]] * 20_000, [None] * 140_000, [[None] * 70_000, [1] * 70_000], {str(n): n for n in range(22_000)}],
+    ids=["arrays", "values", "values in two", "a map"],
+)
+def test_what_takes_long_to_read_is_neither_sent_nor_taken(value: Any) -> None:
+    """Its sender is told, so that only its own call ends; who sends it nevertheless loses the connection."""
+    with pytest.raises(ProtocolError, match=r"too_large: a Call: more than"):
+        encode(m.Call("c", "s", {"v": value}))
+    with pytest.raises(ProtocolError, match=r"malformed: .*more than"):
+        decode(msgpack.packb([4, "c", "s", {"v": value}]))
+
+
+def test_a_value_of_the_global_memory_fits() -> None:
+    """1 MiB of bytes, of text or of floats."""
+    for value in (bytes(MIB), "x" * MIB, [1.5] * (MIB // 9)):
+        call = m.Call("c", "memory.put", {"name": "a", "value": value})
+        assert decode(encode(call)).arguments["value"] == value  # type: ignore[union-attr]
 
 
 def test_what_is_no_plain_data_is_not_encoded() -> None:

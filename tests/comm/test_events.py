@@ -14,7 +14,7 @@ from services.comm.events import KEPT, EventBoard
 def _node(*names: str, role: str = "coordinator") -> Callee:
     callee = Callee("motion", "n1", {"move": Offer()})
     for name in names:
-        callee.link_up(0.0, name, m.Hello(1, 1, role, name, "b"))
+        callee.link_up(0.0, name, m.Hello(2, 2, role, name, "b"))
     return callee
 
 
@@ -33,7 +33,7 @@ def test_a_latched_event_waits_for_a_coordinator_that_is_away() -> None:
     callee.raise_event(1.1, "caught", source="barrier", latched=True)
     callee.raise_event(1.1, "tick", source="timer")
     assert callee.messages() == []
-    callee.link_up(2.0, "coord", m.Hello(1, 1, "coordinator", "coord", "b"))
+    callee.link_up(2.0, "coord", m.Hello(2, 2, "coordinator", "coord", "b"))
     assert _heard(callee, "coord") == [("caught", 1)]
 
 
@@ -80,10 +80,10 @@ def test_an_event_of_a_run_goes_to_its_caller_and_is_gone_with_the_run() -> None
     assert [to for to, message in callee.messages() if message == event] == ["coord"]
     callee.link_down(0.2, "coord")
     callee.finish(0.3, "1", "success")
-    callee.link_up(0.4, "coord", m.Hello(1, 1, "coordinator", "coord", "b"))
+    callee.link_up(0.4, "coord", m.Hello(2, 2, "coordinator", "coord", "b"))
     assert _heard(callee, "coord") == [("ball_lost", 1)]
     callee.receive(0.5, "coord", m.ResultAck("1"))
-    callee.link_up(0.6, "coord", m.Hello(1, 1, "coordinator", "coord", "b"))
+    callee.link_up(0.6, "coord", m.Hello(2, 2, "coordinator", "coord", "b"))
     assert _heard(callee, "coord") == []
 
 
@@ -92,7 +92,7 @@ def test_one_that_leaves_in_good_order_is_sent_nothing_when_it_is_back() -> None
     callee.receive(0.0, "coord", m.Subscribe(("caught",)))
     callee.receive(0.1, "coord", m.Bye("done"))
     callee.raise_event(0.2, "caught", latched=True)
-    callee.link_up(0.3, "coord", m.Hello(1, 1, "coordinator", "coord", "b2"))
+    callee.link_up(0.3, "coord", m.Hello(2, 2, "coordinator", "coord", "b2"))
     assert _heard(callee, "coord") == []
     callee.receive(0.4, "coord", m.Subscribe(("caught",)))
     assert _heard(callee, "coord") == [("caught", 1)]
@@ -112,7 +112,7 @@ _steps = st.lists(st.sampled_from(["raise a", "raise b", "cut", "connect", "carr
 @given(_steps, st.integers(0, 3))
 def test_every_latched_event_arrives_once_and_in_order_of_its_source(steps: list[str], lost: int) -> None:
     callee = Callee("motion", "n1", {})
-    caller = Caller("motion", m.Hello(1, 1, "coordinator", "coord", "b"))
+    caller = Caller("motion", m.Hello(2, 2, "coordinator", "coord", "b"))
     caller.subscribe(0.0, ("a", "b"))
     raised: list[m.Event] = []
     arrived: list[m.Event] = []

@@ -33,7 +33,7 @@ from services.comm.server import Server
 
 NOW = datetime.now(UTC).replace(microsecond=0)
 DAY = timedelta(days=1)
-HELLO = m.Hello(1, 1, "client", "asking", "a1")
+HELLO = m.Hello(2, 2, "client", "asking", "a1")
 
 
 @pytest.fixture(autouse=True)

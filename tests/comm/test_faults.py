@@ -19,6 +19,7 @@ from services.comm.caller import Accepted, Caller, Ended, Late, Notice, PeerBack
 from services.comm.client import Client
 from services.comm.messages import Executed
 from services.comm.stream import Incoming, StreamReceiver
+from services.comm.under_way import Patience
 
 from .fault_parts import HOST, STREAM, Cable, Fault, first_line, inflict, part
 
@@ -32,7 +33,7 @@ class Told:
     def __init__(self, port: int) -> None:
         self.notices: list[Notice] = []
         self.changed = asyncio.Event()
-        self.caller = Caller("motion", m.Hello(1, 1, "coordinator", "coord", "c1", 1))
+        self.caller = Caller("motion", m.Hello(2, 2, "coordinator", "coord", "c1", 1))
         self.client = Client(HOST, port, self.caller, on_notices=self._take)
         self.client.start()
 
@@ -80,6 +81,48 @@ async def test_a_node_that_is_lost_is_named_and_its_run_ends_once_with_unknown(
         assert told.order() == ["PeerBack", "Accepted", "PeerLost", "Ended"]
         await told.client.close()
         cable.close()
+
+
+async def test_the_run_of_a_killed_node_ends_as_soon_as_its_port_refuses() -> None:
+    """It does not wait for the 2 s that a broken link has to come back; a process that takes the port is another boot, which is
+    not sent the call again."""
+    with part("node") as process:
+        port = int(await asyncio.to_thread(first_line, process))
+        told = Told(port)
+        await told.begin()
+        # Far longer than anything waits here: only the refusing port can end the run.
+        told.caller._patience = told.caller._absence._patience = Patience(reconnect=2 * LIMIT)
+        process.kill()
+        ended = (await told.until(Ended)).outcome
+    assert (ended.cause, ended.executed) == ("lost", Executed.UNKNOWN) and "nothing listens" in ended.text
+    assert told.order() == ["PeerBack", "Accepted", "PeerLost", "Ended"]
+    told.caller.call(told.client.now(), m.Call("2", "move"))
+    told.client.flush()
+    late = (await told.until(Ended, 2)).outcome
+    assert (late.cause, late.executed) == ("unreachable", Executed.NO)
+    with part("node", str(port), "n2") as again:
+        await asyncio.to_thread(first_line, again)
+        back = await told.until(PeerBack, 2)
+        assert not back.same_boot and back.runs == (), "nothing was sent to it"
+        told.caller.call(told.client.now(), m.Call("3", "move"))
+        told.client.flush()
+        await told.until(Accepted, 2)
+        await told.client.close()
+    assert told.order().count("Ended") >= 2, "the first two once each; the third goes on until its caller leaves"
+
+
+async def test_a_broken_link_to_a_node_that_lives_keeps_its_run() -> None:
+    """The connection is reset, the port still takes connections: the same boot is found again, and the run goes on."""
+    with part("node") as process:
+        told = Told(int(await asyncio.to_thread(first_line, process)))
+        await told.begin()
+        for number in range(2, 12):
+            assert told.client._link is not None
+            told.client._link.cut("a fault")
+            back = await told.until(PeerBack, number)
+            assert back.same_boot and back.runs == ("1",)
+        assert "Ended" not in told.order()
+        await told.client.close()
 
 
 async def test_a_node_that_thaws_is_back_and_stops_the_run_that_was_given_up() -> None:

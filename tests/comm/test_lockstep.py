@@ -19,11 +19,11 @@ from hypothesis import strategies as st
 
 from services.comm import messages as m
 from services.comm.cell import Cell, CellError, Delays
-from services.comm.codec import encode
 from services.comm.lockstep import Member, PartyLostError
 from services.comm.party import TICK, Envelope, Party, Posted
 from tests.waiting import Limit
 
+from .ends import frame
 from .toy_party import Toy
 
 TOY = Path(__file__).parent / "toy_party.py"
@@ -305,13 +305,8 @@ def test_a_member_that_never_comes_is_named() -> None:
 def _join(address: tuple[str, int], name: str = "b", directory: str = "") -> socket.socket:
     """A member made by hand."""
     sock = socket.create_connection(address, timeout=60.0)
-    sock.sendall(_frame(m.Hello(1, 1, "party", name, "x", 0, directory)))
+    sock.sendall(frame(m.Hello(2, 2, "party", name, "x", 0, directory), "a"))
     return sock
-
-
-def _frame(message: m.Message) -> bytes:
-    body = encode(message)
-    return len(body).to_bytes(4, "big") + body
 
 
 @pytest.mark.parametrize(
@@ -319,15 +314,15 @@ def _frame(message: m.Message) -> bytes:
     [
         pytest.param(None, r"no end of tick 0 for 0\.3 s: lost", id="silent"),
         pytest.param(b"", "its process ended without a word", id="gone"),
-        pytest.param(_frame(m.Tick(1)), "tick 1 came after tick -1", id="tick left out"),
-        pytest.param(b"\x00\x00\x00\x02\xff\xff", "it broke the protocol: unknown_kind", id="random bytes"),
-        pytest.param(_frame(m.Ping(1)), "a Ping has no place in lock step", id="another kind"),
-        pytest.param(_frame(m.Refuse("failed", "it failed: no luck")), "b: it failed: no luck", id="failed"),
+        pytest.param(frame(m.Tick(1)), "tick 1 came after tick -1", id="tick left out"),
+        pytest.param(b"\x00\x00\x00\x02\xff\xff", "it broke the protocol: bad_check", id="random bytes"),
+        pytest.param(frame(m.Ping(1)), "a Ping has no place in lock step", id="another kind"),
+        pytest.param(frame(m.Refuse("failed", "it failed: no luck")), "b: it failed: no luck", id="failed"),
         pytest.param(
-            _frame(m.Tick(0, (Posted(0, 0, _envelope("z", 1, party="a")),))), "does not belong here", id="due at once"
+            frame(m.Tick(0, (Posted(0, 0, _envelope("z", 1, party="a")),))), "does not belong here", id="due at once"
         ),
         pytest.param(
-            _frame(m.Tick(0, (Posted(1, 0, _envelope("z", 1, party="q")),))), "does not belong here", id="not for a"
+            frame(m.Tick(0, (Posted(1, 0, _envelope("z", 1, party="q")),))), "does not belong here", id="not for a"
         ),
     ],
 )
@@ -361,8 +356,8 @@ def test_strangers_do_not_keep_a_cell_from_forming() -> None:
         said = []
         for first in (
             b"GET / HTTP/1.1\r\n\r\n",
-            _frame(m.Hello(1, 1, "node", "b", "x")),
-            _frame(m.Hello(1, 1, "party", "q", "x")),
+            frame(m.Hello(2, 2, "node", "b", "x"), "a"),
+            frame(m.Hello(2, 2, "party", "q", "x"), "a"),
         ):
             with socket.create_connection(addresses["a"], timeout=60.0) as sock:
                 sock.sendall(first)

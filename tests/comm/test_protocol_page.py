@@ -9,12 +9,13 @@ from pathlib import Path
 import pytest
 
 from services.comm import messages as m
-from services.comm.codec import LIMITS, encode
+from services.comm.codec import LIMITS
 from services.comm.link import Timing
 from services.comm.results import Keeping
 from services.comm.under_way import Patience
 
 from .conftest import KINDS
+from .ends import frame
 
 PAGE = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text(encoding="utf-8")
 ROWS = {int(row[1]): row for row in re.finditer(r"^\| (\d+) (\w+) \| (\w+) \| (.*) \| ([\d]+ \w+) \|$", PAGE, re.M)}
@@ -41,7 +42,7 @@ def test_the_example() -> None:
     call = m.Call("c1", "track", {"t": 1.5}, 2.0, 3, "b1", "p0", 7)
     block = PAGE.split("parent `p0`, seed 7:\n```\n")[1].split("```")[0]
     shown = b"".join(bytes.fromhex(re.split(r"  +", line)[0]) for line in block.splitlines())
-    assert shown == len(encode(call)).to_bytes(4, "big") + encode(call)
+    assert shown == frame(call)
 
 
 def test_the_codes_and_causes_are_the_codes() -> None:

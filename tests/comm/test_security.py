@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hmac
+import os
 from pathlib import Path
 
 import pytest
@@ -72,3 +73,41 @@ def test_any_other_address_needs_one(host: str) -> None:
     with pytest.raises(KeyNeededError, match="vision: refuses to listen"):
         require_key("vision", host, None)
     require_key("vision", host, new_key())
+
+
+def test_a_key_of_another_user_is_refused(tmp_path: Path) -> None:
+    """He could change it; root's is taken, as root can do so anyway."""
+    path = tmp_path / "cell.key"
+    write_key(path, new_key())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("os.geteuid", lambda: path.stat().st_uid + 1000)
+        if path.stat().st_uid == 0:
+            assert read_key(path)
+    if os.geteuid() != 0:
+        pytest.skip("only root can give a file away")
+    os.chown(path, 12345, 12345)
+    with pytest.raises(KeyFileError, match="belongs to another user"):
+        read_key(path)
+
+
+def test_a_key_file_is_looked_at_and_read_in_one_piece(tmp_path: Path) -> None:
+    """What is checked is what is read: whoever changes the name in between changes nothing. A pipe does not hold anyone up."""
+    good, other = tmp_path / "cell.key", tmp_path / "other.key"
+    key = new_key()
+    write_key(good, key)
+    other.write_text(new_key().hex())
+    other.chmod(0o666)
+    real = os.fstat
+
+    def swap(number: int) -> os.stat_result:
+        found = real(number)
+        other.replace(good)
+        return found
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("os.fstat", swap)
+        assert read_key(good) == key
+    pipe = tmp_path / "pipe.key"
+    os.mkfifo(pipe, 0o600)
+    with pytest.raises(KeyFileError, match="not a regular file"):
+        read_key(pipe)

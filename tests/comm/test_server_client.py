@@ -138,19 +138,20 @@ async def test_other_hosts_cannot_connect_without_a_key(host: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("hello", "key", "code"),
+    ("hello", "key", "cause", "code"),
     [
-        (m.Hello(2, 9, "coordinator", "coord", "c1"), None, "version"),
-        (m.Hello(1, 1, "coordinator", "coord", "c1"), b"k" * 32, "no_key_here"),
+        (m.Hello(3, 9, "coordinator", "coord", "c1"), None, "refused", "version"),
+        (m.Hello(2, 2, "coordinator", "coord", "c1"), b"k" * 32, "unreachable", "no_key_here"),
     ],
 )
 async def test_a_refused_caller_is_told_why_and_its_calls_end(
-    open_node: Node, hello: m.Hello, key: bytes | None, code: str
+    open_node: Node, hello: m.Hello, key: bytes | None, cause: str, code: str
 ) -> None:
+    """At once where nothing could prove the refusal; with a key one that is not proven ends nothing, and is tried again."""
     coordinator = open_node.client(hello, key=key)
     outcome = await coordinator.client.call("echo")
-    assert (outcome.cause, outcome.executed) == ("refused", Executed.NO)
-    assert code in outcome.text
+    assert (outcome.cause, outcome.executed) == (cause, Executed.NO)
+    assert code in outcome.text and ("unauthenticated refusal" in outcome.text) is (key is not None)
     await coordinator.client.close()
 
 
@@ -159,7 +160,8 @@ async def test_a_wrong_key_is_told_to_both(key: bytes | None) -> None:
     await node.server.start("127.0.0.1", 0)
     coordinator = node.client(key=key)
     outcome = await coordinator.client.call("echo")
-    assert outcome.cause == "refused" and ("wrong_key" if key else "key_needed") in outcome.text
+    assert outcome.cause == ("unreachable" if key else "refused")
+    assert ("unauthenticated refusal: wrong_key" if key else "refuses the connection: key_needed") in outcome.text
     assert set(node.server.faults) == {"wrong_key" if key else "key_needed"}
     await coordinator.client.close()
     await node.server.close()
@@ -168,11 +170,11 @@ async def test_a_wrong_key_is_told_to_both(key: bytes | None) -> None:
 async def test_a_second_process_of_a_name_is_refused_and_a_newer_epoch_takes_over(open_node: Node) -> None:
     first = open_node.client()
     assert await first.client.connected(60.0)
-    second = open_node.client(m.Hello(1, 1, "coordinator", "coord", "c2", 1))
+    second = open_node.client(m.Hello(2, 2, "coordinator", "coord", "c2", 1))
     outcome = await second.client.call("echo")
     assert "name_taken" in outcome.text
     await second.client.close()
-    third = open_node.client(m.Hello(1, 1, "coordinator", "coord", "c3", 2))
+    third = open_node.client(m.Hello(2, 2, "coordinator", "coord", "c3", 2))
     assert await third.client.connected(60.0)
     await first.notice(PeerLost)
     outcome = await first.client.call("echo")

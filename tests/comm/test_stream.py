@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -11,10 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.comm import messages as m
-from services.comm.codec import encode
 from services.comm.security import KeyNeededError
 from services.comm.stream import Incoming, Inlet, StreamReceiver, StreamSender
 from services.comm.stream_line import Lateness
+
+from .ends import frame
 
 
 class Sink:
@@ -101,7 +103,7 @@ def receiver(sink: Sink, key: bytes | None) -> Iterator[StreamReceiver]:
 
 @pytest.fixture
 def sender(receiver: StreamReceiver, key: bytes | None) -> Iterator[StreamSender]:
-    one = StreamSender("vision", "catch_point", 0.04, *receiver.address, ticket="t1", key=key)
+    one = StreamSender("vision", "catch_point", 0.04, *receiver.address, receiver="motion", ticket="t1", key=key)
     yield one
     one.close()
 
@@ -152,7 +154,7 @@ def test_the_newest_sender_of_a_stream_takes_it_over(
     sink: Sink, receiver: StreamReceiver, sender: StreamSender, key: bytes | None
 ) -> None:
     _until(lambda: bool(sink.got), lambda: sender.send((1.0,)), receiver.poll)
-    other = StreamSender("vision2", "catch_point", 0.04, *receiver.address, ticket="t1", key=key)
+    other = StreamSender("vision2", "catch_point", 0.04, *receiver.address, receiver="motion", ticket="t1", key=key)
     _until(lambda: sink.got[-1] is not None and sink.got[-1][0] == (2.0,), lambda: other.send((2.0,)), receiver.poll)
     assert len(receiver.sockets()) == 2
     other.close()
@@ -170,7 +172,7 @@ def test_the_newest_sender_of_a_stream_takes_it_over(
 def test_a_stream_that_does_not_fit_is_refused_with_the_reason(
     sink: Sink, receiver: StreamReceiver, key: bytes | None, stream: str, period: float, ticket: str, code: str
 ) -> None:
-    sender = StreamSender("vision", stream, period, *receiver.address, ticket=ticket, key=key)
+    sender = StreamSender("vision", stream, period, *receiver.address, receiver="motion", ticket=ticket, key=key)
     _until(lambda: bool(sender.refusal), lambda: sender.send((1.0,)), receiver.poll)
     assert sender.refusal.startswith(code) and not sender.up
     assert receiver.faults >= 1 and sink.got == []
@@ -180,24 +182,21 @@ def test_a_stream_that_does_not_fit_is_refused_with_the_reason(
 @pytest.mark.parametrize("key", [b"k" * 32], indirect=True, ids=["sealed"])
 def test_a_sender_without_the_key_is_refused(sink: Sink, receiver: StreamReceiver) -> None:
     for wrong in (None, b"x" * 32):
-        sender = StreamSender("vision", "catch_point", 0.04, *receiver.address, ticket="t1", key=wrong)
+        sender = StreamSender(
+            "vision", "catch_point", 0.04, *receiver.address, receiver="motion", ticket="t1", key=wrong
+        )
         _until(lambda one=sender: bool(one.refusal), lambda one=sender: one.send((1.0,)), receiver.poll)  # type: ignore[misc]
         assert "key" in sender.refusal
         sender.close()
     assert sink.got == []
 
 
-def _frame(message: m.Message) -> bytes:
-    body = encode(message)
-    return len(body).to_bytes(4, "big") + body
-
-
-OPENING = _frame(m.Hello(1, 1, "stream", "vision", "b")) + b""
+OPENING = frame(m.Hello(2, 2, "stream", "vision", "b"))
 MALFORMED = [
     pytest.param([b"\x00\x00\x00\x05hello"], id="random bytes"),
-    pytest.param([OPENING, _frame(m.SetPoint(1, (1.0,)))], id="no STREAM_OPEN"),
-    pytest.param([OPENING, _frame(m.StreamOpen("catch_point", 0.04, "t1")), b"\xff" * 9], id="bad set point"),
-    pytest.param([OPENING, bytes.fromhex("00 00 00 0c 93 16 01 91 cb 7f f8 00 00 00 00 00 00")], id="nan"),
+    pytest.param([OPENING, frame(m.SetPoint(1, (1.0,)))], id="no STREAM_OPEN"),
+    pytest.param([OPENING, frame(m.StreamOpen("catch_point", 0.04, "t1")), b"\xff" * 9], id="bad set point"),
+    pytest.param([OPENING, frame(m.SetPoint(1, (math.nan,)))], id="nan"),
 ]
 
 

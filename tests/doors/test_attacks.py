@@ -22,12 +22,14 @@ from hypothesis import strategies as st
 
 from services.comm import messages as m
 from services.comm.wire import Connection, ProtocolError, Side
+from tests.comm.ends import head
 from tests.doors.conftest import HELLO, KEY, MIB, GoodClient, Stranger, Victim, frame
 from tests.waiting import Limit, beat
 
 pytestmark = pytest.mark.processes
 Start = Callable[..., Victim]
-STRANGE = m.Hello(1, 1, "client", "mallory", "m1")
+AUTH = b"\x20vision" + bytes(32)
+STRANGE = m.Hello(2, 2, "client", "mallory", "m1")
 TOLERATED = 24 * MIB
 """By how much the victim's resident set may grow while it is attacked."""
 
@@ -48,19 +50,19 @@ async def no_key(stranger: Stranger) -> None:
 
 async def older_version(stranger: Stranger) -> None:
     """A version with fewer checks, if there ever was one."""
-    await stranger.say(frame(m.Hello(0, 0, "client", "mallory", "m1", auth=bytes(32))))
+    await stranger.say(frame(m.Hello(0, 0, "client", "mallory", "m1", auth=AUTH)))
 
 
 async def newer_version(stranger: Stranger) -> None:
     """A version that is not spoken here."""
-    await stranger.say(frame(m.Hello(7, 9, "client", "mallory", "m1", auth=bytes(32))))
+    await stranger.say(frame(m.Hello(7, 9, "client", "mallory", "m1", auth=AUTH)))
 
 
 async def downgraded_version(stranger: Stranger) -> None:
     """Somebody between the two changes the versions of an honest HELLO: the proof is of another transcript."""
-    honest = Connection(Side.CLIENT, key=KEY, nonce=bytes(32))
+    honest = Connection(Side.CLIENT, "vision", key=KEY, nonce=bytes(32))
     hello = honest.send(m.Hello(1, 4, "client", "ana", "a1"))
-    await stranger.say(hello.replace(struct.pack("BB", 1, 4), struct.pack("BB", 1, 1), 1))
+    await stranger.say(hello.replace(struct.pack("BB", 1, 4), struct.pack("BB", 1, 2), 1))
     body = await stranger._body()
     honest.receive_data(len(body).to_bytes(4, "big") + body)
     await stranger.say(honest.data_to_send())
@@ -69,13 +71,13 @@ async def downgraded_version(stranger: Stranger) -> None:
 async def old_epoch(stranger: Stranger) -> None:
     """A coordinator of a time before, with the right key."""
     with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError, ProtocolError):
-        await stranger.open(KEY, m.Hello(1, 1, "coordinator", "coord", "c0", 2))
+        await stranger.open(KEY, m.Hello(2, 2, "coordinator", "coord", "c0", 2))
 
 
 async def taken_name(stranger: Stranger) -> None:
     """Another process under the good client's name and epoch."""
     with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError, ProtocolError):
-        await stranger.open(KEY, m.Hello(1, 1, "coordinator", "coord", "c9", 3))
+        await stranger.open(KEY, m.Hello(2, 2, "coordinator", "coord", "c9", 3))
 
 
 async def repeated_frame(stranger: Stranger) -> None:
@@ -114,7 +116,7 @@ async def oversized_hello(stranger: Stranger) -> None:
 async def oversized_call(stranger: Stranger) -> None:
     """17 MiB announced on an open connection."""
     await stranger.open(KEY, STRANGE)
-    await stranger.say((17 * MIB).to_bytes(4, "big") + frame(m.Call("m/1", "echo"))[4:])
+    await stranger.say(head(17 * MIB) + frame(m.Call("m/1", "echo"))[4:])
 
 
 async def out_of_turn(stranger: Stranger) -> None:
@@ -213,7 +215,7 @@ async def test_what_a_server_said_is_no_proof_of_its_key(victim: Start) -> None:
 
     over = asyncio.Event()
     fake = await asyncio.start_server(impostor, "127.0.0.1", 0)
-    connection = Connection(Side.CLIENT, key=KEY, nonce=os.urandom(32))
+    connection = Connection(Side.CLIENT, "vision", key=KEY, nonce=os.urandom(32))
     reader, writer = await asyncio.open_connection(*fake.sockets[0].getsockname())
     writer.write(connection.send(HELLO))
     with pytest.raises(ProtocolError, match="wrong_key"):
@@ -235,7 +237,7 @@ async def test_what_a_server_said_is_no_proof_of_its_key(victim: Start) -> None:
 async def test_slow_loris(victim: Start, keyed: bool) -> None:
     """Two hundred connections that drip a HELLO byte by byte: none lasts, none keeps the good client out."""
     server = victim(timing={"handshake": 0.5}, **({"key": KEY.hex()} if keyed else {}))
-    hello = frame(m.Hello(1, 1, "client", "mallory", "m1", auth=bytes(32) if keyed else b""))
+    hello = frame(m.Hello(2, 2, "client", "mallory", "m1", auth=AUTH if keyed else b""))
 
     async def drip() -> None:
         stranger = await Stranger.at(server)
@@ -265,7 +267,7 @@ def server_second(server: Victim) -> Any:
 
 @contextlib.asynccontextmanager
 async def _second(server: Victim) -> Any:
-    good = GoodClient(server.client(m.Hello(1, 1, "coordinator", "second", "s1", 1)))
+    good = GoodClient(server.client(m.Hello(2, 2, "coordinator", "second", "s1", 1)))
     await good.begin()
     try:
         yield good
@@ -456,13 +458,13 @@ def feed(data: bytes) -> None:
     """Both ends of the protocol, in every state that a stranger can reach, given these bytes; nothing but ProtocolError."""
     for key in (None, KEY):
         for side in Side:
-            connection = Connection(side, key=key, nonce=bytes(32) if key else b"")
+            connection = Connection(side, "vision", key=key, nonce=bytes(32) if key else b"")
             if side is Side.CLIENT:
                 connection.send(HELLO)
             with contextlib.suppress(ProtocolError):
                 for message in connection.receive_data(data):
                     if isinstance(message, m.Hello):
-                        connection.send(m.Welcome(1, "vision", "v1"))
+                        connection.send(m.Welcome(2, "vision", "v1"))
                 connection.receive_data(data)
 
 
@@ -482,7 +484,7 @@ def beginnings() -> list[bytes]:
         m.StreamOpen("points", 0.02, "t"), m.SetPoint(1, (1.0, 2.0)), m.Withdraw(), m.Bye("x"), m.Refuse("c", "t"),
     ]  # fmt: skip
     back: list[m.Message] = [
-        m.Welcome(1, "v", "b", ("echo",)),
+        m.Welcome(2, "v", "b", ("echo",)),
         m.Challenge(bytes(32)),
         m.Outcome("m/1", "success", {"n": 1}),
     ]

@@ -66,7 +66,7 @@ from services.comm.caller import Caller
 from services.comm.client import Client
 
 async def main():
-    hello = m.Hello(1, 1, "coordinator", "far", "f1", 1)
+    hello = m.Hello(2, 2, "coordinator", "far", "f1", 1)
     client = Client(sys.argv[1], int(sys.argv[2]), Caller("vision", hello, auto_ack=True), key=bytes.fromhex(sys.argv[3]))
     client.start()
     async with asyncio.timeout(60):

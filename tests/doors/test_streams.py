@@ -37,7 +37,7 @@ class GuardedOperator(Operator):
         """Connect to the nodes."""
         proves = credentials(self.directory, "coordinator")
         for node in nodes:
-            hello = Hello(1, 1, "coordinator", "operator", f"{self.boot} {node}", 1, self.directory.hash)
+            hello = Hello(2, 2, "coordinator", "operator", f"{self.boot} {node}", 1, self.directory.hash)
             caller, (host, port) = Caller(node, hello, auto_ack=True), self.directory.address(node)
             client = Client(host, port, caller, on_notices=self._take, key=proves.key, tls=proves.client())
             self.clients[node] = client
@@ -95,7 +95,7 @@ def test_a_strangers_set_points_move_nothing(key: bytes | None, ticket: str, say
     """Without the key, with another key, without the ticket."""
     sink = Taken()
     receiver = StreamReceiver("arm", {"points": Incoming(0.02, sink, "secret.1")}, key=b"k" * 32)
-    sender = StreamSender("mallory", "points", 0.02, *receiver.address, ticket=ticket, key=key)
+    sender = StreamSender("mallory", "points", 0.02, *receiver.address, receiver="arm", ticket=ticket, key=key)
     for _ in range(10_000):
         sender.send([1.0])
         receiver.poll()
@@ -111,7 +111,7 @@ def test_strangers_do_not_hold_up_the_loop_that_polls() -> None:
     """However many connect and send, one poll takes a few connections and a few bytes of each: the good stream goes on."""
     sink = Taken()
     receiver = StreamReceiver("arm", {"points": Incoming(0.02, sink, "t.1")})
-    good = StreamSender("vision", "points", 0.02, *receiver.address, ticket="t.1")
+    good = StreamSender("vision", "points", 0.02, *receiver.address, receiver="arm", ticket="t.1")
     limit = Limit("the first value")
     while not sink.values and limit.left():
         good.send([1.0])

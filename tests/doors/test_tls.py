@@ -130,7 +130,7 @@ async def test_a_party_speaks_under_the_name_on_its_certificate(
     """A node whose key was stolen cannot give orders to the others' devices."""
     assert may_speak_as(party, role, name) is welcome
     server = victim(folder=str(certificates))
-    client = server.client(m.Hello(1, 1, role, name, "b1"), tls=context(certificates, party))
+    client = server.client(m.Hello(2, 2, role, name, "b1"), tls=context(certificates, party))
     outcome = await outcome_of(client)
     assert (outcome.status == "success") is welcome
     if not welcome:

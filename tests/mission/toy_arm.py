@@ -100,7 +100,7 @@ class Bench:
     def __init__(
         self, *, on_resume: str = "rejoin", epoch: int = 1, store: Store | None = None, device: str = 'device = "arm"'
     ) -> None:
-        self.caller = Caller("motion", m.Hello(1, 1, "coordinator", "m", f"c{epoch}", epoch))
+        self.caller = Caller("motion", m.Hello(2, 2, "coordinator", "m", f"c{epoch}", epoch))
         places = directory(on_resume, device)
         task = loads(TASK, "toy")
         engine = Engine(task, {a.name: a.device for a in places.actions.values() if a.device})
@@ -144,7 +144,7 @@ class Bench:
     def link(self, now: float, boot: str = "n1", runs: Sequence[str] = ()) -> None:
         """The node welcomes us."""
         self.boot = boot
-        self.caller.link_up(now, m.Welcome(1, "motion", boot, (), tuple(runs)))
+        self.caller.link_up(now, m.Welcome(2, "motion", boot, (), tuple(runs)))
         self.go(now)
 
     def say(self, now: float, *messages: Message) -> None:

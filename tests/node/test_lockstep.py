@@ -130,7 +130,7 @@ class Coordinator:
         self.heard: list[tuple[int, Notice]] = []
         self.tick = 0
         self.made = 0
-        hello = Hello(1, 1, "coordinator", self.name, "boot", 1, places.hash)
+        hello = Hello(2, 2, "coordinator", self.name, "boot", 1, places.hash)
         self.callers = {n: Caller(n, hello, auto_ack=True) for n in places.nodes if not places.nodes[n].sim}
         for caller in self.callers.values():
             caller.open(0.0)

@@ -100,7 +100,7 @@ class Operator:
 
     async def connect(self, *nodes: str) -> None:
         for node in nodes:
-            hello = Hello(1, 1, "coordinator", "operator", f"{self.boot} {node}", 1, self.directory.hash)
+            hello = Hello(2, 2, "coordinator", "operator", f"{self.boot} {node}", 1, self.directory.hash)
             caller = Caller(node, hello, auto_ack=True)
             host, port = self.directory.address(node)
             self.clients[node] = Client(host, port, caller, on_notices=self._take)
@@ -410,7 +410,7 @@ async def _beyond(operator: Operator, position: float) -> bool:
 
 async def test_an_orphaned_run_is_stopped(nodes: Nodes, operator: Operator) -> None:
     other = Operator(nodes.directory)
-    hello = Hello(1, 1, "coordinator", "leaver", "boot", 1, nodes.directory.hash)
+    hello = Hello(2, 2, "coordinator", "leaver", "boot", 1, nodes.directory.hash)
     client = Client(*nodes.directory.address("left"), Caller("left", hello, auto_ack=True), on_notices=other._take)
     client.start()
     assert await client.connected(PATIENCE)

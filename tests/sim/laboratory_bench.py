@@ -45,7 +45,7 @@ class LaboratoryBench:
         self.answers: list[Outcome] = []
         self._inbox: list[Envelope] = []
         self._calls = 0
-        self.post("call", "coordinator", Hello(1, 99, "coordinator", "coordinator", "boot"))
+        self.post("call", "coordinator", Hello(2, 99, "coordinator", "coordinator", "boot"))
 
     @property
     def now(self) -> float:

@@ -47,7 +47,7 @@ async def running(file: Path) -> AsyncIterator[LaboratoryShell]:
 
 async def call(address: tuple[str, int], service: str, **arguments: Any) -> Outcome:
     """Call a service, under a name of its own: a caller of one name and boot numbers its calls from 1."""
-    caller = Caller("laboratory", Hello(1, 99, "client", f"test {next(NUMBERS)}", "boot"))
+    caller = Caller("laboratory", Hello(2, 99, "client", f"test {next(NUMBERS)}", "boot"))
     client = Client(*address, caller, on_notices=lambda now, notices: None)
     client.start()
     try:
@@ -74,7 +74,7 @@ class Looker:
     def __init__(self, calls: Sequence[Call]) -> None:
         self.score: dict[str, Any] = {}
         self._last = calls[-1].id
-        self._out: list[Any] = [Hello(1, 99, "coordinator", self.name, "boot"), *calls]
+        self._out: list[Any] = [Hello(2, 99, "coordinator", self.name, "boot"), *calls]
 
     def receive(self, now: float, envelope: Envelope) -> None:
         """Keep the score."""

@@ -1,0 +1,184 @@
+"""Whoever answers must be the node that was asked for: a man in the middle without the key, and a wrong port without a key.
+
+The man in the middle is a process of nobody's: it takes what comes on a node's address and carries it to another node.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+
+from services.comm.security import new_key, write_key
+from tests.doors.test_estop import finished, petrobot
+from tests.node.test_processes import Nodes
+from tests.ports import free_ports
+
+pytestmark = pytest.mark.processes
+HOST = "127.0.0.1"
+CELL = """\
+schema = 1
+[nodes.left]
+host = "127.0.0.1"
+port = {left}
+[nodes.right]
+host = "127.0.0.1"
+port = {right}
+[devices.gauge]
+node = "left"
+driver = "toy_cell.drivers:Slide"
+period = 0.004
+follow = false
+[devices.slide]
+node = "right"
+driver = "toy_cell.drivers:Slide"
+period = 0.004
+follow = false
+"""
+KEYS = '[keys]\nfile = "cell.key"\n'
+
+
+class Middle:
+    """Carries what comes to one port to another one, and can play what a server said in an earlier session."""
+
+    def __init__(self, to: int) -> None:
+        self.to = to
+        self.port = 0
+        self.recorded: list[bytes] = []
+        """What the server said in each session."""
+        self.replay: bytes | None = None
+        """Said in the server's place."""
+        self._server: asyncio.Server | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    async def start(self) -> None:
+        """Listen."""
+        self._server = await asyncio.start_server(self._carry, HOST, 0)
+        self.port = int(self._server.sockets[0].getsockname()[1])
+
+    async def _carry(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError):
+            if self.replay is not None:
+                await reader.read(1)
+                writer.write(self.replay)
+                await reader.read()
+            else:
+                there, back = await asyncio.open_connection(HOST, self.to)
+                number = len(self.recorded)
+                self.recorded.append(b"")
+
+                async def answers() -> None:
+                    while data := await there.read(1 << 16):
+                        self.recorded[number] += data
+                        writer.write(data)
+                    writer.close()
+
+                answering = asyncio.ensure_future(answers())
+                while data := await reader.read(1 << 16):
+                    back.write(data)
+                back.close()
+                await asyncio.gather(answering, return_exceptions=True)
+        writer.close()
+
+    async def stop(self) -> None:
+        """Hang up."""
+        assert self._server is not None
+        self._server.close()
+        for task in list(self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+
+class Deceived:
+    """Two nodes, and what their callers believe to be their addresses."""
+
+    def __init__(self, folder: Path, keyed: bool) -> None:
+        self.folder = folder
+        self.keyed = keyed
+        left, right = free_ports(2)
+        self.ports = {"left": left, "right": right}
+        self.text = CELL.format(left=left, right=right) + (KEYS if keyed else "")
+        self.middles: list[Middle] = []
+
+    async def between(self, **to: str) -> Path:
+        """The location file of a caller whose way to these nodes leads to others; gives its path."""
+        ports = dict(self.ports)
+        for node, other in to.items():
+            middle = Middle(self.ports[other])
+            await middle.start()
+            self.middles.append(middle)
+            ports[node] = middle.port
+        path = self.folder / "believed.toml"
+        path.write_text(CELL.format(**ports) + (KEYS if self.keyed else ""))
+        return path
+
+    async def estop(self, services: Path) -> tuple[int, dict[str, str]]:
+        """`petrobot estop`: exit code, and of each node why it did not answer (empty: it did)."""
+        options = ["--services", str(services), "--journal", str(self.folder / "runs"), "--json", "-"]
+        state = str(self.folder / "state of the caller's host")
+        code, out, err = await finished(petrobot("estop", *options, PETROBOT_STATE=state))
+        assert out, err
+        return code, {one["node"]: one["why"] or "?" * (one["seconds"] is None) for one in json.loads(out)["nodes"]}
+
+
+@asynccontextmanager
+async def deceived(folder: Path, keyed: bool) -> AsyncIterator[Deceived]:
+    """The two nodes as processes, with a shared key or without."""
+    cell = Deceived(folder, keyed)
+    if keyed:
+        write_key(folder / "cell.key", new_key())
+    (folder / "services.toml").write_text(cell.text)
+    nodes = await asyncio.to_thread(Nodes, folder, "left", "right", text=cell.text)
+    try:
+        yield cell
+    finally:
+        for middle in cell.middles:
+            await middle.stop()
+        nodes.stop()
+
+
+@pytest.mark.parametrize("keyed", [True, False], ids=["shared key", "no key"])
+async def test_estop_names_each_node_that_was_not_reached(tmp_path: Path, keyed: bool) -> None:
+    """Both ways to one node, both swapped, one led astray: never exit code 0, and only who was really told counts as told."""
+    async with deceived(tmp_path, keyed) as cell:
+        straight = await cell.between(left="left", right="right")
+        assert await cell.estop(straight) == (0, {"left": "", "right": ""}), "somebody who only listens changes nothing"
+        for ways, missed in (
+            ({"left": "left", "right": "left"}, {"right"}),
+            ({"left": "right", "right": "left"}, {"left", "right"}),
+            ({"left": "right", "right": "right"}, {"left"}),
+        ):
+            code, told = await cell.estop(await cell.between(**ways))
+            assert code == 3 and {node for node, why in told.items() if why} == missed, (ways, told)
+            assert all("wrong_node" in told[node] and f"{node} was asked for" in told[node] for node in missed), told
+
+
+async def test_a_recorded_session_stops_nobody(tmp_path: Path) -> None:
+    """What the right node said to an earlier `estop` is said again: the proof is of other nonces."""
+    async with deceived(tmp_path, True) as cell:
+        services = await cell.between(left="left", right="right")
+        assert (await cell.estop(services))[0] == 0
+        for middle in cell.middles:
+            middle.replay = middle.recorded[0]
+        code, told = await cell.estop(services)
+        assert code == 3 and all("wrong_key" in why for why in told.values()), told
+
+
+async def test_nodes_shows_a_wrong_port(tmp_path: Path) -> None:
+    """Two ports mixed up in services.toml, no key: each is said to be the other, and neither counts as up."""
+    async with deceived(tmp_path, False) as cell:
+        services = await cell.between(left="right", right="left")
+        code, out, err = await finished(petrobot("nodes", "--services", str(services), "--json", "-"))
+        told = json.loads(out)
+        assert code == 3, err
+        assert "this is right, left was asked for" in told["left"]["why"]
+        assert "this is left, right was asked for" in told["right"]["why"]
