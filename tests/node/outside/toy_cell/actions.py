@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import time
 from typing import Any
 
 from services.action import Cancelled, Context, Result, Status, error, failure, success
@@ -194,6 +195,12 @@ async def order_directly(ctx: Context, *, send: list[dict[str, Any]], seconds: f
     for body in send:
         ctx.device.command(ctx.now, body)
     await ctx.sleep(seconds)
+    return success()
+
+
+def block(ctx: Context, *, seconds: float) -> Result:
+    """A service that keeps its node's loop from everything else."""
+    time.sleep(seconds)
     return success()
 
 
