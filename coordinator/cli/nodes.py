@@ -66,12 +66,20 @@ def _print(answers: dict[str, Any]) -> None:
         table.add_column(column)
     for node, answer in answers.items():
         state = "[green]up[/]" if answer["up"] else "[red]away[/]"
-        devices = answer.get("status", {}).get("devices", {})
-        shown = _devices(devices, answer.get("stopped", []))
+        shown = _devices(_told(answer.get("status", {})), answer.get("stopped", []))
         ends = [_ends(answer.get("certificate_ends", ""))] if certified else []
         offers = ", ".join(answer.get("offers", [answer.get("why", "")]))
         table.add_row(node, answer["address"], state, *ends, offers, shown)
     Console().print(table)
+
+
+def _told(status: Mapping[str, Any]) -> dict[str, Any]:
+    """By device what it told; of one that did not answer, that it did not."""
+    devices = dict(status.get("devices", {}))
+    for device, answer in status.get("answers", {}).items():
+        if answer != "up" and not devices.get(device, {}).get("text"):
+            devices[device] = {**devices.get(device, {}), "text": answer}
+    return devices
 
 
 def _devices(devices: Mapping[str, Any], stopped: Sequence[str]) -> str:

@@ -29,7 +29,7 @@ _INT_MIN, _INT_MAX = -(2**63), 2**64 - 1
 _INT64 = 2**63
 _KEY, _SHORT_INT = 60, 200
 """Characters of a key, and bits of an integer, that stand in an error's text."""
-_MOST_FOREIGN = 1_000_000
+_MOST_FOREIGN = 100_000
 """Items of a mapping that is not a dict: what yields them may never end."""
 
 # The base's own method takes the content of a subclass as it is, whatever the subclass has made of `str()` or `__iter__`.
