@@ -40,16 +40,19 @@ class Guard:
         self._latch = latch
         self._heard = NEVER
         """When the node last said something (s)."""
+        self._again = False
+        """Whether it has got another moment since."""
 
     def heard(self, now: float, beat: bool) -> None:
         """The node has said something, and whether it was a beat."""
         if beat or self._heard < NEVER:
-            self._heard = now
+            self._heard, self._again = now, False
 
     def look(self, now: float) -> str:
         """Cause for which the device must stand: EMERGENCY_STOP, NODE_SILENT, or empty. Call it when `due`, after reading."""
-        if now - self.due > SILENCE / 2 and self._heard < NEVER:  # as the heart of a link does
-            self._heard = max(self._heard, now - SILENCE + AGAIN)
+        if now - self.due > SILENCE / 2 and self._heard < NEVER and not self._again:
+            # Once only: a process that is late at each look must not wait for ever.
+            self._heard, self._again = max(self._heard, now - SILENCE + AGAIN), True
         self.due = now + GUARD_LOOK
         stopped = self._latch.stopped()
         if self._device in stopped or ALL in stopped:

@@ -56,6 +56,10 @@ class Refusing(Protocol):
     def sent(self) -> int:
         """Number of the last command sent."""
 
+    @property
+    def age(self) -> float:
+        """Seconds since the driver last published its state."""
+
     def refusal(self, since: int) -> str | None:
         """Why a command after number `since` was refused that no action has looked at; empty if none was, None as long as
         the driver still has commands to take."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from math import inf
 from typing import Any, Protocol
 
 from services.action import Cancelled, Result, Status
@@ -293,9 +294,15 @@ class Runner:
             self._end(now, run, run.result)
 
     def _with_refusal(self, run: Execution, text: str) -> str:
-        """The text of an ERROR, and what the driver refused without the action's looking: that is often the reason."""
-        refusal = self._refusing.refusal(run.sent_before) if self._refusing is not None else ""
-        return f"{text}; the driver refused a command: {refusal}".lstrip("; ") if refusal else text
+        """The text of an ERROR, and what the driver refused without the action's looking, or that it is silent: that is often
+        the reason."""
+        if self._refusing is None:
+            return text
+        if refusal := self._refusing.refusal(run.sent_before):
+            text = f"{text}; the driver refused a command: {refusal}"
+        if TAKEN_WITHIN < (age := self._refusing.age) < inf:
+            text = f"{text}; the driver has published nothing for {age:.1f} s"
+        return text.lstrip("; ")
 
     # --- end ---------------------------------------------------------------------------------------------------------
 

@@ -143,7 +143,8 @@ class Worker:
         """Stop device and runs without an order where nobody may be able to give one."""
         cause, before = guard.look(now), self._barred
         self._barred = cause
-        if cause and cause != before:
+        # With a run again and again: it may have begun between a clearing and the next stop, both since the last look.
+        if cause and (cause != before or self._place.runs):
             self._place.bar(now, cause)
 
     def _pause(self) -> float | None:

@@ -29,6 +29,7 @@ from services.comm import messages
 from services.comm.caller import Caller
 from services.comm.directory import Directory
 from services.comm.messages import Answer, Call, Command, Outcome
+from services.comm.plain import NotPlainError
 
 ESCALATION: Final = 3.0
 """Seconds after a run's own time to stop that its node needs at most for the stop routine and the kill of its worker."""
@@ -136,16 +137,21 @@ class Dispatch:
         flight = self.flights[start.run] = Flight(start, entry.node, entry.device, now)
         if entry.device in self._fences and not entry.at_once:
             flight.waits = True
-        else:
-            self._call(now, flight)
-        return []
+            return []
+        return self._call(now, flight)
 
-    def _call(self, now: float, flight: Flight) -> None:
+    def _call(self, now: float, flight: Flight) -> list[Stimulus]:
+        """Call the flight's action; gives its end where its arguments are what no message carries."""
         flight.waits = False
         start, boot = flight.start, flight.boot
         arguments = {**self.directory.actions[start.action].args, **start.arguments}
         call = Call(self.call_id(start.run), start.action, arguments, start.deadline, boot=boot, seed=self._seed)
-        self.callers[flight.node].call(now, replace(call, again=bool(boot)))
+        try:
+            self.callers[flight.node].call(now, replace(call, again=bool(boot)))
+        except NotPlainError as fault:
+            del self.flights[start.run]
+            return [RunEnded(start.run, Status.ERROR, "bad_arguments", str(fault), flight.if_unsent)]
+        return []
 
     def _cancel(self, now: float, cancel: CancelRun) -> list[Stimulus]:
         flight = self.flights.get(cancel.run)
@@ -223,9 +229,10 @@ class Dispatch:
         if run == outcome.id or "#" not in run:
             return []
         self._parting.pop(run, None)
+        stimuli: list[Stimulus] = [_run_ended(run, outcome)]
         for device in self._fences.lift(run):
-            self._go_on(now, device)
-        return [_run_ended(run, outcome)]
+            stimuli += self._go_on(now, device)
+        return stimuli
 
     def answered(self, now: float, answer: Answer) -> list[Stimulus]:
         """The answer to a hold."""
@@ -256,17 +263,17 @@ class Dispatch:
             flight = self._parting.pop(fence.run, None)
             if flight is not None and flight.cancelled:
                 stimuli.append(StopConfirmed(fence.run, Executed.UNKNOWN))
-            self._go_on(now, device)
+            stimuli += self._go_on(now, device)
         for run, flight in [(r, f) for r, f in self.flights.items() if f.waits and now >= f.begun + f.start.deadline]:
             del self.flights[run]
             text = f"{flight.device} is not known to stand still after {self._fences[flight.device].run}"
             stimuli.append(RunEnded(run, Status.ERROR, "device_fenced", text, flight.if_unsent))
         return stimuli
 
-    def _go_on(self, now: float, device: str) -> None:
+    def _go_on(self, now: float, device: str) -> list[Stimulus]:
         """The device is free: start what waited for it."""
-        for flight in [f for f in self.flights.values() if f.waits and f.device == device]:
-            self._call(now, flight)
+        waiting = [f for f in self.flights.values() if f.waits and f.device == device]
+        return [stimulus for flight in waiting for stimulus in self._call(now, flight)]
 
     @property
     def idle(self) -> bool:
@@ -371,9 +378,8 @@ class Dispatch:
             return self.ended(now, Outcome(id_, Status.ERROR, {}, FORGOTTEN, text, messages.Executed.UNKNOWN))
         if entry.device in self._fences and not entry.at_once and not known:
             flight.waits = True
-        else:
-            self._call(now, flight)
-        return []
+            return []
+        return self._call(now, flight)
 
     def _abandon(self, now: float, run: str) -> list[Stimulus]:
         flight = self.flights.pop(run)

@@ -166,11 +166,16 @@ async def _order(directory: Directory, credentials: Credentials, node: str, verb
         if verb == STOP:
             if not bus:
                 await _answered(stopped, asking, NODE_LATE)
+            if not bus and not stopped.answered:
+                # The processes of its devices look at the latch themselves: they stop although the node may be frozen.
+                stopped.latch = await _latch(directory, node)
             if bus or not stopped.answered:
                 stopped.bus = await _stop_buses(directory, node)
         await asking
         if verb == STOP and not stopped.answered:
-            stopped.latch = await _latch(directory, node)
+            stopped.latch = stopped.latch or await _latch(directory, node)
+        elif stopped.answered:
+            stopped.latch = ""  # it was only late, and keeps the stop itself
         if verb == CLEAR and not stopped.answered and not line.reached:
             stopped.latch, stopped.cleared = await _unlatch(directory, node)
     finally:

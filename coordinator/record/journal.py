@@ -30,7 +30,8 @@ FORMAT = 1
 MAGIC = b"PETROJ%d\n" % FORMAT
 _FAMILY = re.compile(rb"PETROJ(\d+)\n")
 PREFIX = struct.Struct("<II")
-SMALLEST_RECORD, LARGEST_RECORD = 4, 1 << 24
+SMALLEST_RECORD, LARGEST_RECORD = 4, 1 << 25
+"""Bytes of a record's payload. What a node may send in one message must find room in it, with all that is kept beside it."""
 _ARRAY_OF_THREE = 0x93
 
 

@@ -250,27 +250,26 @@ def encode(message: Message) -> bytes:
     through `plain`.
     """
     kind = message.KIND
-    if kind == _TICK:
-        body: bytes = _packed(message, lambda: msgpack.packb([kind, *_tick_out(message)], default=_extension))
-        return _small_enough(message, body)
     writer = WRITERS.get(kind)
     row: Sequence[Any] | None = writer(message) if writer is not None else None
-    if row is None:
-        row = _row(message)
-    body = _packed(message, lambda: _pack(row))
+    try:
+        if row is None and kind == _TICK:
+            return _small_enough(message, msgpack.packb([kind, *_tick_out(message)], default=_extension))
+        if row is None:
+            row = _row(message)
+        body: bytes = _pack(row)
+    except (TypeError, ValueError, OverflowError) as fault:
+        raise _unpackable(message, fault) from None
     if len(body) > LIMITS[kind] or len(body) > UNCOUNTED:
         return _small_enough(message, body)
     return body
 
 
-def _packed(message: Message, pack: Callable[[], bytes]) -> bytes:
-    try:
-        return pack()
-    except UnicodeEncodeError as fault:
+def _unpackable(message: Message, fault: Exception) -> ProtocolError:
+    if isinstance(fault, UnicodeEncodeError):
         found = f"U+{ord(fault.object[fault.start]):04X} in {fault.object[:40]!r}"
-        raise ProtocolError("unencodable", f"expected text that UTF-8 can carry, found {found}") from None
-    except (TypeError, ValueError, OverflowError) as fault:
-        raise ProtocolError("unencodable", f"{type(message).__name__}: {fault}") from None
+        return ProtocolError("unencodable", f"expected text that UTF-8 can carry, found {found}")
+    return ProtocolError("unencodable", f"{type(message).__name__}: {fault}")
 
 
 def _small_enough(message: Message, body: bytes) -> bytes:

@@ -63,6 +63,8 @@ _HOST_NAME = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?(\.[A-Za-z0-9
 """Letters, digits and hyphens in labels (RFC 1123); underscores, which many local networks have, too."""
 _IMPORT_PATH = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 _NAME = re.compile(r"[A-Za-z_][\w-]*")
+LONGEST_NAME = 200
+"""Characters of a name: with what is put before or behind it (`memory:`, `stream:`) it still is one in any message."""
 
 
 def _path_key(what: str, *, required: bool = False) -> Key:
@@ -253,6 +255,8 @@ def _entries(
             continue
         if not _NAME.fullmatch(name):
             faults.add(here, "a name has letters, digits, _ and - only, and starts with a letter")
+        if len(name) > LONGEST_NAME:
+            faults.add(here, f"a name has at most {LONGEST_NAME} characters, found {len(name)}")
         for key, value in entry.items():
             _check_key(f"{here}.{key}", key, value, shape, table in OPEN, faults)
         for key, spec in shape.items():

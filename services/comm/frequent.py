@@ -65,18 +65,14 @@ READERS: Mapping[int, Reader] = {Call.KIND: _call, Outcome.KIND: _outcome}
 
 
 def _call_row(call: Any) -> tuple[Any, ...] | None:
-    id_, service, deadline, epoch, boot, parent, seed = (
-        call.id,
-        call.service,
-        call.deadline,
-        call.epoch,
-        call.boot,
-        call.parent,
-        call.seed,
-    )
+    id_, service, deadline, epoch = call.id, call.service, call.deadline, call.epoch
+    boot, parent, seed = call.boot, call.parent, call.seed
     if (
         type(id_) is type(service) is type(boot) is type(parent) is str
-        and max(len(id_), len(service), len(boot), len(parent)) <= NAME_LENGTH
+        and len(id_) <= NAME_LENGTH
+        and len(service) <= NAME_LENGTH
+        and len(boot) <= NAME_LENGTH
+        and len(parent) <= NAME_LENGTH
         and (deadline is None or (type(deadline) is float and 0.0 <= deadline < inf))
         and type(epoch) is type(seed) is int
         and 0 <= epoch < COUNT_END
@@ -92,8 +88,10 @@ def _outcome_row(end: Any) -> tuple[Any, ...] | None:
     if (
         type(id_) is type(cause) is type(text) is str
         and isinstance(status, str)
-        and max(len(id_), len(status), len(cause)) <= NAME_LENGTH
-        and end.executed in EXECUTED
+        and len(id_) <= NAME_LENGTH
+        and len(status) <= NAME_LENGTH
+        and len(cause) <= NAME_LENGTH
+        and (type(end.executed) is Executed or end.executed in EXECUTED)
         and type(seconds) is type(cpu) is float
         and 0.0 <= seconds < inf
         and 0.0 <= cpu < inf

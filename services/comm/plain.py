@@ -29,7 +29,7 @@ _INT_MIN, _INT_MAX = -(2**63), 2**64 - 1
 _INT64 = 2**63
 _KEY, _SHORT_INT = 60, 200
 """Characters of a key, and bits of an integer, that stand in an error's text."""
-_MOST_FOREIGN = 1_000_000
+_MOST_FOREIGN = 100_000
 """Items of a mapping that is not a dict: what yields them may never end."""
 
 # The base's own method takes the content of a subclass as it is, whatever the subclass has made of `str()` or `__iter__`.
@@ -60,7 +60,8 @@ def plain(value: Any, where: str = "value") -> Any:
     one process or in two. `where` names the data in the error. Raises NotPlainError; whether a whole message of it is small
     enough is for `codec.encode` to say.
     """
-    return _plain(value, where, DEPTH, [MAX_CONTAINERS])
+    left = [MAX_CONTAINERS]
+    return _plain_dict(value, where, DEPTH, left) if type(value) is dict else _plain(value, where, DEPTH, left)
 
 
 def _plain(value: Any, where: str, depth: int, left: list[int]) -> Any:
@@ -92,6 +93,9 @@ def _plain_dict(value: Mapping[Any, Any], where: str, depth: int, left: list[int
         kind = type(item)
         if kind in _SIMPLE or (kind is int and -_INT64 <= item < _INT64):
             copy[key] = item  # as below, without naming the place
+        elif kind is list and depth > 1 and left[0] > 0 and _SIMPLE.issuperset(map(type, item)):
+            left[0] -= 1
+            copy[key] = item[:]  # likewise
         else:
             copy[key] = _plain(item, f"{where}.{key[:_KEY]}", depth - 1, left)
     return copy

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from coordinator.engine import Begin, Hold, Pause, Phase, Resume
-from coordinator.mission.dispatch import ESCALATION
+from coordinator.engine import Begin, Hold, Pause, Phase, Resume, RunEnded, StartRun
+from coordinator.mission.dispatch import ESCALATION, Dispatch
 from coordinator.mission.fences import STOP_MARGIN
 from coordinator.record.journal import JournalError, JournalWriter
 from coordinator.record.recording import JournalStore
 from coordinator.task import Executed, Status
 from services.comm import messages as m
-from tests.mission.toy_arm import TIDY, WORK, Bench
+from services.comm.caller import Caller
+from tests.mission.toy_arm import TIDY, WORK, Bench, directory
 
 STOPPED = "preempted by rung"
 WITHIN = 1.0
@@ -327,3 +329,19 @@ def test_a_sync_from_outside_leaves_nothing_due(tmp_path: Path) -> None:
     bench.go(0.7)
     due = bench.executor.due()
     assert store.safe and (due is None or due > 0.7)
+
+
+# --- arguments that no message carries -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("arguments", [{"x": {1: 2}}, {"x": [[]] * 60_000, "y": [[]] * 60_000}, {"x": 2**70}])
+def test_arguments_that_no_message_carries_end_their_run_alone(arguments: dict[str, Any]) -> None:
+    """Two results, each small enough, may be too much for the one call that they are fed to."""
+    caller = Caller("motion", m.Hello(1, 1, "coordinator", "m", "c1", 1))
+    dispatch = Dispatch(directory(), {"motion": caller}, "m", 0)
+    (end,) = dispatch.carry_out(0.0, StartRun("work#1", "work", "work", "do_work", arguments, 1.0))
+    assert isinstance(end, RunEnded)
+    assert (end.run, end.status, end.cause, end.executed) == ("work#1", Status.ERROR, "bad_arguments", Executed.NO)
+    assert "arguments." in end.text and not dispatch.flights
+    assert dispatch.carry_out(0.0, StartRun("work#2", "work", "work", "do_work", {}, 1.0)) == []
+    assert list(dispatch.flights) == ["work#2"]

@@ -109,8 +109,11 @@ async def operator(node: OneNode) -> AsyncIterator[Operator]:
 
 
 async def works(operator: Operator, name: str) -> None:
-    """The device takes runs again."""
-    end = await operator.call(name, None, send=[], seconds=0.01)
+    """The device takes runs again, as soon as its driver comes back to take them."""
+    until = time.monotonic() + PATIENCE
+    while (end := await operator.call(name, None, send=[], seconds=0.01)).cause == "fenced":
+        assert time.monotonic() < until, end
+        await asyncio.sleep(0.1)
     assert (end.status, end.text) == ("success", "")
 
 
@@ -212,6 +215,20 @@ async def test_nodes_shows_what_was_refused_and_missed(
     shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert code == 0 and f"{status['refused']} refused" in shown and "cycles missed" in shown, shown
     assert "cycles were left out" in node.log.read_text()
+
+
+async def test_a_driver_that_blocks_is_named_at_the_deadline(
+    node: OneNode, operator: Operator, capsys: pytest.CaptureFixture[str]
+) -> None:
+    running = asyncio.create_task(operator.call("good", 2.5, send=[{"block": 5.0}], seconds=60.0))
+    await operator.heard(Accepted)
+    await asyncio.sleep(0.5)
+    await asyncio.to_thread(main, ["nodes", "--services", str(node.file)])
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "no answer" in shown, shown
+    end = await running
+    assert end.cause == "deadline" and "the driver has published nothing for" in end.text, end
+    await works(operator, "good")
 
 
 async def test_a_driver_that_takes_no_commands(operator: Operator) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import textwrap
@@ -196,3 +197,31 @@ def test_a_busy_machine_does_not_trip_the_watchdog(monkeypatch: pytest.MonkeyPat
     dog.end()
     dog.look()
     dog.close()
+
+
+@pytest.mark.parametrize("by", ["a person", "the action"])
+def test_ctrl_c_of_a_person_is_not_taken_for_the_actions(by: str) -> None:
+    """In lock step both come as KeyboardInterrupt at the same place: the one ends the command, the other the run alone."""
+
+    def act(ctx: Any) -> Any:
+        if by == "a person":
+            signal.raise_signal(signal.SIGINT)
+            return None
+        raise KeyboardInterrupt
+
+    inline = Inline("")
+    inline.place = InlinePlace(
+        {"order": ActionEntry("order", "tests:none", "task", "here", "")},
+        clock=inline.clock,
+        substitutes={"order": act},
+        virtual=True,
+    )
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        if by == "a person":
+            with pytest.raises(KeyboardInterrupt):
+                inline.run()
+        else:
+            assert (inline.run().cause, inline.ends[0].text.split()[0]) == ("exception", "KeyboardInterrupt:")
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -168,6 +168,7 @@ class Broken:
             time.sleep(float(body["block"]))
         self._fail("command")
         self._moving = bool(body.get("go")) or self._moving
+        self._note()
 
     def step(self, now: float) -> None:
         """Write down whether it moves."""

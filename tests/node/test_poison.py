@@ -1,0 +1,301 @@
+"""What cannot be sent ends the run that made it, alone: no value of an action costs the connection, a worker or another run."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import socket
+import threading
+import time
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from services.action import Result, Status, success
+from services.comm import messages as m
+from services.comm.codec import ProtocolError, decode, encode
+from services.comm.directory import parse
+from services.comm.notice import PeerLost
+from services.context import checked, checked_result
+from services.pipe import Pipe
+from services.runs import Ended, flat, record
+from tests.node.conftest import Bench
+from tests.node.test_heard import OneNode
+from tests.node.test_processes import Operator, operator_of
+from tests.ports import free_ports
+
+CELL = """\
+schema = 1
+[nodes.only]
+host = "127.0.0.1"
+port = {port}
+[devices.slide]
+node = "only"
+driver = "toy_cell.drivers:Slide"
+period = 0.004
+[streams.points]
+to = "slide"
+period = 0.02
+[services.memory]
+node = "only"
+[services.sum_service]
+node = "only"
+run = "toy_cell.actions:add"
+[services.serve]
+node = "only"
+run = "toy_cell.poison:serve"
+[services.wait_and_give]
+node = "only"
+run = "toy_cell.poison:give"
+[actions]
+give = {{ run = "toy_cell.poison:give", task = "give", node = "only" }}
+nap = {{ run = "toy_cell.actions:nap", task = "nap", node = "only" }}
+echo = {{ run = "toy_cell.poison:echo", task = "echo", node = "only" }}
+"""
+
+
+def table(*names: str) -> list[str]:
+    from toy_cell import poison  # type: ignore[import-not-found]  # tests/node/outside
+
+    return [kind for name in names for kind in getattr(poison, name)]
+
+
+@pytest.fixture(scope="module")
+def node(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OneNode]:
+    one = OneNode(tmp_path_factory.mktemp("poison"), CELL.format(port=free_ports(1)[0]))
+    one.until_ready()
+    yield one
+    one.stop()
+
+
+@pytest.fixture
+async def operator(node: OneNode) -> AsyncIterator[Operator]:
+    async with operator_of(node.directory, "only") as one:
+        yield one
+
+
+async def ends_alone(operator: Operator, service: str, kind: str, cause: str) -> m.Outcome:
+    """The run ends so, and an innocent one beside it and the connection know nothing of it."""
+    innocent = asyncio.create_task(operator.call("nap", None, seconds=0.1))
+    end = await operator.call(service, None, kind=kind)
+    assert (end.status, end.cause, end.executed) == ("error", cause, "yes"), end
+    assert end.text and len(end.text) < 5_000
+    assert (await innocent).status == "success"
+    assert not [notice for notice in operator.notices if isinstance(notice, PeerLost)]
+    return end
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("kind", table("RESULTS"))
+async def test_what_an_action_returns(operator: Operator, kind: str) -> None:
+    end = await ends_alone(operator, "give", kind, "bad_result")
+    if kind == "long cause":
+        assert "cause: expected at most 255 characters, found 1,234: put long words into the text" in end.text
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("kind", table("RAISES", "SAYS", "ASKS"))
+async def test_what_an_action_raises_says_and_asks(operator: Operator, kind: str) -> None:
+    await ends_alone(operator, "give", kind, "exception")
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("kind", table("RESULTS"))
+@pytest.mark.parametrize("service", ["serve", "wait_and_give"])
+async def test_what_a_service_returns(operator: Operator, service: str, kind: str) -> None:
+    await ends_alone(operator, service, kind, "bad_result")
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("kind", table("RAISES"))
+@pytest.mark.parametrize("service", ["serve", "wait_and_give"])
+async def test_what_a_service_raises(operator: Operator, service: str, kind: str) -> None:
+    await ends_alone(operator, service, kind, "exception")
+
+
+def test_many_large_records_at_once() -> None:
+    """Each fits; together they are more than a pipe keeps while it reads."""
+    near, far = socket.socketpair()
+    worker, node = Pipe(near), Pipe(far)
+    large = bytes(15 << 20)
+    for number in range(6):
+        worker.post([number, large])
+    writing = threading.Thread(target=lambda: flush_all(worker))
+    writing.start()
+    got: list[list[Any]] = []
+    until = time.monotonic() + 60.0
+    while len(got) < 6 and time.monotonic() < until:
+        got += node.read()
+    writing.join(60.0)
+    assert [(number, data == large) for number, data in got] == [(number, True) for number in range(6)]
+    worker.close()
+    node.close()
+
+
+def flush_all(pipe: Pipe) -> None:
+    """Send all that waits."""
+    until = time.monotonic() + 60.0
+    while pipe.unsent and time.monotonic() < until:
+        pipe.flush()
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(
+    ("service", "arguments"),
+    [("echo", {"value": bytes(17 << 20)}), ("echo", {"value": [[]] * 99_998}), ("s" * 256, {}), ("\ud800", {})],
+    ids=["large", "many containers", "long name", "half a letter"],
+)
+async def test_a_call_that_cannot_be_sent_never_leaves(operator: Operator, service: str, arguments: Any) -> None:
+    client = operator.clients["only"]
+    innocent = asyncio.create_task(operator.call("nap", None, seconds=0.1))
+    end = await asyncio.wait_for(client.call(service, arguments), 30.0)
+    assert (end.status, end.executed) == ("error", "no") and end.cause in ("too_large", "unencodable"), end
+    assert (await innocent).status == "success"
+    assert not [notice for notice in operator.notices if isinstance(notice, PeerLost)]
+
+
+# --- the same rules at both ends -------------------------------------------------------------------------------------
+
+LEAVES = (
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.text(st.characters(), max_size=5)
+    | st.text(st.characters(categories=["Cs", "Lu"]), max_size=3)
+    | st.binary(max_size=5)
+    | st.sampled_from(
+        [np.float32(1.5), np.int64(3), np.bool_(True), np.str_("x"), np.zeros(2), 1j, {1}, object(), Status.ERROR]
+    )
+)
+KEYS = st.text(max_size=4) | st.booleans() | st.integers() | st.none()
+VALUES = st.recursive(
+    LEAVES,
+    lambda inner: st.lists(inner, max_size=4) | st.tuples(inner, inner) | st.dictionaries(KEYS, inner, max_size=4),
+    max_leaves=30,
+)
+CAUSES = (
+    st.text(max_size=5) | st.integers(250, 260).map("x".__mul__) | st.sampled_from(["\ud800", None, 3, ValueError("v")])
+)
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether both are the same data, NaN included."""
+    if isinstance(one, float) and isinstance(other, float):
+        return one == other or (math.isnan(one) and math.isnan(other))
+    if isinstance(one, dict) and isinstance(other, dict):
+        return list(one) == list(other) and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(map(same, one, other))
+    return type(one) is type(other) and bool(one == other)
+
+
+@given(VALUES, CAUSES, st.sampled_from([*Status, "success", "perhaps", 3]), st.text(max_size=3) | st.just("\udc00"))
+@settings(suppress_health_check=[HealthCheck.too_slow], max_examples=400, deadline=None)
+def test_a_result_crosses_unchanged_or_is_refused_where_it_is_made(
+    value: Any, cause: Any, status: Any, text: str
+) -> None:
+    """Through the pipe of its worker and over the wire: never is there a third way."""
+    try:
+        made = checked_result("m/p#1", Result(status, {"value": value}, cause, text))
+    except ValueError as fault:
+        assert str(fault)
+        encode(m.Outcome("m/p#1", "error", {}, "bad_result", str(fault)))
+        return
+    near, far = socket.socketpair()
+    worker, node = Pipe(near), Pipe(far)
+    worker.post(flat(Ended("m/p#1", made.status, made.values, made.cause, made.text)))
+    (ended,) = [record(items) for items in node.read()]
+    worker.close()
+    node.close()
+    assert isinstance(ended, Ended)
+    sent = m.Outcome(ended.id, ended.status, ended.values, ended.cause, ended.text)
+    got = decode(encode(sent))
+    assert isinstance(got, m.Outcome)
+    assert same(got.values, dict(made.values)) and (got.cause, got.text, got.status) == (
+        made.cause,
+        made.text,
+        made.status,
+    )
+
+
+@given(VALUES)
+@settings(suppress_health_check=[HealthCheck.too_slow], max_examples=200, deadline=None)
+def test_a_run_that_returns_anything_ends_once_and_alone(value: Any) -> None:
+    def act(ctx: Any) -> Any:
+        return success(value=value)
+
+    async def innocent(ctx: Any) -> Result:
+        await ctx.sleep(0.02)
+        return success()
+
+    from services.comm.directory import ActionEntry
+    from services.runner import Runner
+    from tests.node.conftest import Clock
+
+    clock = Clock()
+    entries = {name: ActionEntry(name, "tests:none", "task", "here", "") for name in ("act", "innocent")}
+    actions = {"act": act, "innocent": innocent}
+    bench = Bench(clock, None, Runner(entries, clock=clock, substitutes=actions, virtual=True))
+    first, second = bench.begin("act"), bench.begin("innocent")
+    bench.tick(0.1)
+    assert bench.ended(second).status == "success"
+    assert (bench.ended(first).status, bench.ended(first).cause) in {("success", ""), ("error", "bad_result")}
+
+
+NAMES = st.text(max_size=4) | st.integers(250, 260).map("x".__mul__) | st.just("\ud800")
+NUMBERS = st.integers() | st.floats() | st.booleans() | st.none() | st.just("1")
+MESSAGES = (
+    st.builds(m.Call, NAMES, NAMES, st.just({}), NUMBERS, NUMBERS, NAMES, NAMES, NUMBERS)
+    | st.builds(
+        m.Outcome,
+        NAMES,
+        NAMES,
+        st.just({}),
+        NAMES,
+        NAMES,
+        st.sampled_from([*m.Executed]),
+        NUMBERS,
+        NUMBERS,
+        st.booleans(),
+    )
+    | st.builds(m.Event, NAMES, NAMES, NUMBERS, VALUES, NAMES)
+    | st.builds(m.Feedback, NAMES, NUMBERS, VALUES)
+    | st.builds(m.SetPoint, NUMBERS, st.lists(NUMBERS, max_size=3).map(tuple), NUMBERS, NUMBERS)
+    | st.builds(m.Subscribe, st.lists(NAMES, max_size=3).map(tuple))
+    | st.builds(m.Command, NAMES, NAMES, NAMES, VALUES)
+    | st.builds(m.Answer, NAMES, st.booleans(), VALUES)
+    | st.builds(m.ResultAck, NAMES, st.lists(NAMES, max_size=3).map(tuple))
+    | st.builds(m.StreamOpen, NAMES, NUMBERS, NAMES)
+    | st.builds(m.Ping, NUMBERS)
+)
+
+
+@given(MESSAGES)
+@settings(suppress_health_check=[HealthCheck.too_slow], max_examples=1_000, deadline=None)
+def test_what_is_encoded_is_decoded(message: m.Message) -> None:
+    """One table for both ways: whatever the sender lets through, the receiver takes, unchanged."""
+    try:
+        body = encode(message)
+    except ProtocolError as fault:
+        assert fault.code in ("unencodable", "too_large") and fault.text
+        return
+    again = encode(decode(body))
+    assert again == body or decode(again) == decode(body)
+
+
+def test_what_passes_where_it_is_made_passes_at_the_end() -> None:
+    checked(m.Event("e" * 255, "a", 1, {"x": bytes(1 << 20)}, "r"))
+    with pytest.raises(ValueError, match="name: expected at most 255 characters, found 256"):
+        checked(m.Event("e" * 256, "a", 1))
+
+
+def test_a_location_file_whose_names_are_too_long_is_refused(tmp_path: Path) -> None:
+    text = CELL.format(port=7000).replace("nap =", "n" * 300 + " =")
+    with pytest.raises(Exception, match="at most 200 characters, found 300"):
+        parse(text, tmp_path / "services.toml")
