@@ -93,6 +93,19 @@ async def test_run_this_task_takes_free_controls(browser: Browser, page: Page, s
     await expect(tab.get_by_role("toolbar", name="Mission")).to_contain_text("You hold the controls")
 
 
+async def test_what_is_run_from_the_designer_is_seen_whole(browser: Browser, own_page: Page, cell: Simulated) -> None:
+    """Live was not shown while its task was drawn: it is fitted when it is shown, with nothing under the bar or cut off."""
+    tab = await opened(browser, own_page)
+    await tab.get_by_role("tab", name="Design").click()
+    await settled(tab)
+    assert (await cell.station.command("ana", "take_controls", {}))["ok"]
+    assert (await cell.station.command("ana", "load", {"task": "moving"}))["ok"]
+    await tab.get_by_role("tab", name="Live").click()
+    await expect(element(tab, "^Control place jobs", "Task net")).to_be_visible()
+    fits = "() => { const { view } = petrobot.tabs.Live; return view.view === view.fitted && view.view.x !== 0; }"
+    await tab.wait_for_function(fits)
+
+
 async def test_run_this_task_says_who_holds_the_controls(browser: Browser, page: Page, stage: Stage) -> None:
     await stage.command("ana", "take_controls", {})
     tab = await designer(browser, page)

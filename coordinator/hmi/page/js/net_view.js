@@ -411,6 +411,7 @@ export class NetView {
   fit() {
     const box = this.extent;
     const { clientWidth: w, clientHeight: h } = this.svg;
+    if (!w || !h) this.fitted = this.view; // on a tab that is not shown: fitted when it is
     if (!box || !w || !h) return;
     const top = 46; // the bar lies over the drawing
     const zoom = Math.max(ZOOM[0], Math.min(1.5, (w - 24) / (box[2] - box[0]), (h - top - 12) / (box[3] - box[1])));
