@@ -80,7 +80,8 @@ class Driver(Protocol):
     """One device. Nothing here blocks; `now` is the cell's clock (s).
 
     A method that raises has broken the driver, but for `command` (which refuses so) and `picture`: the device is stopped, its
-    run ends in ERROR with the exception's words, the traceback goes to the node's log, and the driver is made again.
+    run ends in ERROR with the exception's words, and the traceback goes to the node's log. In real time the driver is then made
+    again in a new process; in lock step, where nothing could have made it break but its code, its device works no more.
     """
 
     period: float | None
