@@ -1,4 +1,5 @@
-"""Make what several hosts need to trust each other: one shared key, or certificates (--tls); and say where to copy it."""
+"""Make what several hosts need to trust each other: one shared key, or certificates (--tls); and say where to copy it, and how
+to put it in the place of an older one without an outage."""
 
 from __future__ import annotations
 
@@ -50,8 +51,24 @@ def _shared_key(directory: Directory, file: Path) -> str:
         f"wrote {file}: readable by you alone, never printed, never logged\n"
         f"1. copy it beside services.toml on every host ({hosts}), for example: scp -p {file} HOST:FOLDER/\n"
         f"2. name it in {directory.source}, the same on every host:\n"
-        f'   [keys]\n   file = "{file.name}"'
+        f'   [keys]\n   file = "{file.name}"' + _instead(directory, "file", file.name)
     )
+
+
+def _instead(directory: Directory, kind: str, new: str) -> str:
+    """How to replace what services.toml names now, host by host; empty if it names none of this kind, or this one."""
+    old = directory.keys.get(kind, new)
+    if old == new:
+        return ""
+    both = [f'{kind} = "{new}", also = "{old}"']
+    if kind == "certificates":  # a certificate of the new authority is shown only where all accept it
+        both.insert(0, f'{kind} = "{old}", also = "{new}"')
+    passes = [*both, f'{kind} = "{new}" alone']
+    lines = [
+        f"in the place of {old}, in {len(passes)} rounds; in each, change one host after the other and start its nodes again:"
+    ]
+    lines += [f"   round {number}: [keys] {keys}" for number, keys in enumerate(passes, 1)]
+    return "\n" + "\n".join([*lines, f"then remove {old} from every host"])
 
 
 def _certificates(directory: Directory, folder: Path) -> str:
@@ -87,4 +104,4 @@ def _certificates(directory: Directory, folder: Path) -> str:
             f"3. name the folder in {directory.source}, the same on every host:",
             f'   [keys]\n   certificates = "{folder.name}"',
         ]
-    )
+    ) + _instead(directory, "certificates", folder.name)

@@ -2,10 +2,11 @@
 
     bus = can.Bus(interface="petrobot_stream", channel="tcp://127.0.0.1:7303")      # or "unix:///run/cell/can"
 
-Framing, both directions. First each end sends the six bytes `PBCAN\\x01`. Then every frame is
+Framing, both directions. First each end sends the six bytes `PBCAN\\x02`. Then every frame is
     u32  identifier, big-endian; bit 31 extended (29 bits), bit 30 remote, bit 29 error frame
     u8   DLC, 0 to 8
     DLC bytes of data (none in a remote frame)
+    u32  CRC-32 of all that (IEEE 802.3, as zlib's), big-endian: a real bus has a CRC of its own
 A hub (`can_hub`) passes each frame on to all ports but the one it came from, in order of arrival. A port that sends other things,
 or does not read while more than 256 KiB wait for it, is dropped. Classic CAN only.
 """
@@ -27,7 +28,9 @@ from urllib.parse import urlsplit
 import can
 from can import typechecking
 
-GREETING: Final = b"PBCAN\x01"
+from services.comm.security import CHECK_BYTES, check
+
+GREETING: Final = b"PBCAN\x02"
 EXTENDED: Final = 1 << 31
 REMOTE: Final = 1 << 30
 ERROR: Final = 1 << 29
@@ -43,11 +46,13 @@ class StreamFormatError(ConnectionError):
 
 def encode(word: int, data: bytes, dlc: int | None = None) -> bytes:
     """One frame on the stream; `word` is the identifier with its flag bits, `dlc` differs from the data in remote frames."""
-    return _HEAD.pack(word, len(data) if dlc is None else dlc) + data
+    frame = _HEAD.pack(word, len(data) if dlc is None else dlc) + data
+    return frame + check(frame)
 
 
 class Splitter:
-    """Cuts a byte stream into frames: (word, DLC, data). Raises StreamFormatError on a wrong greeting, DLC or identifier."""
+    """Cuts a byte stream into frames: (word, DLC, data). Raises StreamFormatError on a wrong greeting, DLC, identifier or
+    check."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
@@ -64,10 +69,12 @@ class Splitter:
             word, dlc = _HEAD.unpack_from(buffer, at)
             self._check(word, dlc)
             end = at + _HEAD.size + (0 if word & REMOTE else dlc)
-            if len(buffer) < end:
+            if len(buffer) < end + CHECK_BYTES:
                 break
+            if buffer[end : end + CHECK_BYTES] != check(bytes(buffer[at:end])):
+                raise StreamFormatError("a frame was changed on its way")
             frames.append((word, dlc, bytes(buffer[at + _HEAD.size : end])))
-            at = end
+            at = end + CHECK_BYTES
         del buffer[:at]
         return frames
 

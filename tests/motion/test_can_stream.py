@@ -349,7 +349,22 @@ def test_random_bytes_give_frames_or_a_format_error(data: bytes) -> None:
 
 
 def test_the_framing_byte_by_byte() -> None:
-    assert encode(0x181, b"\x01\x02") == bytes.fromhex("00 00 01 81 02 01 02")
-    assert encode(0x1ABCDEF | EXTENDED, b"") == bytes.fromhex("81 ab cd ef 00")
-    assert encode(0x300 | REMOTE, b"", 4) == bytes.fromhex("40 00 03 00 04")
-    assert bytes.fromhex("50 42 43 41 4e 01") == GREETING
+    assert encode(0x181, b"\x01\x02") == bytes.fromhex("00 00 01 81 02 01 02 01 78 a3 93")
+    assert encode(0x1ABCDEF | EXTENDED, b"") == bytes.fromhex("81 ab cd ef 00 90 5f 1a 0b")
+    assert encode(0x300 | REMOTE, b"", 4) == bytes.fromhex("40 00 03 00 04 9b fa d5 14")
+    assert bytes.fromhex("50 42 43 41 4e 02") == GREETING
+
+
+@given(st.integers(0, 10_000))
+def test_one_changed_bit_is_noticed(bit: int) -> None:
+    """It becomes neither another identifier nor other data; a changed length waits for more, and that is checked in its turn."""
+    frames = [(0x181, 2, b"\x01\x02"), (0x1ABCDEF | EXTENDED, 8, bytes(8)), (0x300 | REMOTE, 4, b"")]
+    raw = bytearray(b"".join(encode(word, data, dlc) for word, dlc, data in frames))
+    raw[bit // 8 % len(raw)] ^= 1 << bit % 8
+    splitter = Splitter()
+    assert splitter.feed(GREETING) == []
+    given: list[tuple[int, int, bytes]] = []
+    with pytest.raises(StreamFormatError):
+        for byte in raw + encode(0x80, b"") * 8:
+            given += splitter.feed(bytes([byte]))
+    assert given == frames[: len(given)]

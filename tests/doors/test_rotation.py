@@ -1,0 +1,136 @@
+"""Keys and authorities are replaced host by host: at every step every node reaches every other, and the coordinator all of them."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from coordinator.certificates import make_certificates
+from services.comm.directory import DirectoryError, parse
+from services.comm.security import new_key, write_key
+from tests.doors.test_streams import GuardedOperator
+from tests.node.test_processes import CELL, PATIENCE, start_node
+from tests.ports import free_ports
+
+pytestmark = pytest.mark.processes
+PASSES = {
+    "shared key": ['file = "old"', 'file = "new"\nalso = "old"', 'file = "new"'],
+    "certificates": [
+        'certificates = "old"', 'certificates = "old"\nalso = "new"', 'certificates = "new"\nalso = "old"',
+        'certificates = "new"',
+    ],
+}  # fmt: skip
+"""What stands under [keys], pass by pass; each host goes on to the next when all have done the one before."""
+
+
+RETRY = 0.1
+"""Seconds between attempts."""
+
+
+class Hosts:
+    """Two hosts and the coordinator's, each with a services.toml of its own."""
+
+    def __init__(self, folder: Path, how: str) -> None:
+        left, right = free_ports(2)
+        self.folder = folder
+        self.cell = CELL.format(left=left, right=right)
+        self.nodes: dict[str, subprocess.Popen[str]] = {}
+        for name in ("old", "new"):
+            if how == "certificates":
+                make_certificates(folder / name, ["coordinator", "left", "right"])
+            else:
+                write_key(folder / name, new_key())
+
+    def write(self, host: str, keys: str) -> Path:
+        """The services.toml of a host, with its keys beside it."""
+        place = self.folder / host
+        place.mkdir(exist_ok=True)
+        for name in ("old", "new"):
+            source = self.folder / name
+            if source.is_dir():
+                shutil.copytree(source, place / name, dirs_exist_ok=True)
+            else:
+                shutil.copy2(source, place / name)
+        path = place / "services.toml"
+        path.write_text(f"{self.cell}[keys]\n{keys}\n")
+        return path
+
+    def restart(self, node: str, keys: str) -> None:
+        """Start a node again with other keys."""
+        self.stop(node)
+        process = self.nodes[node] = start_node(node, self.write(node, keys))
+        assert process.stdout is not None and "ready" in process.stdout.readline()
+
+    def stop(self, node: str) -> None:
+        """End a node, if it runs."""
+        process = self.nodes.pop(node, None)
+        if process is not None:
+            process.terminate()
+            process.communicate(timeout=PATIENCE)
+
+    async def works(self, keys: str) -> None:
+        """A coordinator with these keys reaches both nodes, and they each other: a call, and a stream of set points."""
+        path = await asyncio.to_thread(self.write, "coordinator", keys)
+        operator = GuardedOperator(parse(path.read_text(), path))
+        try:
+            await operator.connect("left", "right")
+            # A node that was away is tried again once a second by the other: that long the first ones may fail.
+            async with asyncio.timeout(PATIENCE):
+                while (await operator.call("relay", a=3)).values.get("sum") != 5:  # node to node
+                    await asyncio.sleep(RETRY)
+                while not await self._follows(operator):
+                    await asyncio.sleep(RETRY)
+        finally:
+            await operator.close()
+
+    @staticmethod
+    async def _follows(operator: GuardedOperator) -> bool:
+        """Whether set points come from node to node."""
+        following = asyncio.create_task(operator.call("follow", seconds=1.0))
+        await operator.call("lead", seconds=0.8)
+        return bool((await following).values["count"])
+
+
+@pytest.mark.parametrize("how", ["shared key", pytest.param("certificates", marks=pytest.mark.proof)])
+async def test_keys_are_replaced_host_by_host_without_an_outage(tmp_path: Path, how: str) -> None:
+    hosts = Hosts(tmp_path, how)
+    passes = PASSES[how]
+    try:
+        for node in ("left", "right"):
+            await asyncio.to_thread(hosts.restart, node, passes[0])
+        await hosts.works(passes[0])
+        for before, after in itertools.pairwise(passes):
+            await asyncio.to_thread(hosts.restart, "left", after)
+            await hosts.works(before)
+            await hosts.works(after)
+            await asyncio.to_thread(hosts.restart, "right", after)
+            await hosts.works(after)
+    finally:
+        for node in list(hosts.nodes):
+            hosts.stop(node)
+
+
+@pytest.mark.parametrize(
+    ("keys", "says"),
+    [
+        ('also = "old.key"', "keys.also: is accepted beside another key, and there is none"),
+        ('file = "a"\ncertificates = "b"', "keys: a shared key and certificates; name one of them"),
+    ],
+)
+def test_an_also_needs_what_it_stands_beside(keys: str, says: str) -> None:
+    text = CELL.format(left=1001, right=1002) + f"[keys]\n{keys}\n"
+    with pytest.raises(DirectoryError, match=says):
+        parse(text, Path("services.toml"))
+
+
+def test_the_hash_leaves_keys_out() -> None:
+    """While they are replaced hosts name different ones; everything else must still be the same."""
+    cell = CELL.format(left=1001, right=1002)
+    hashes = {parse(cell + keys, Path("services.toml")).hash for keys in ("", '[keys]\nfile = "a"\nalso = "b"\n')}
+    assert len(hashes) == 1
+    assert parse(cell.replace("1002", "1003"), Path("services.toml")).hash not in hashes
