@@ -72,7 +72,8 @@ class Pipe:
 
     def post(self, items: list[Any]) -> None:
         """Send a list, or keep what does not fit for `flush`."""
-        self._end_copy()
+        if _Copy.made:
+            os._exit(0)
         if not self.closed:
             self._unsent += self._packer.pack(items)
             self.flush()
@@ -91,7 +92,8 @@ class Pipe:
 
     def read(self) -> list[list[Any]]:
         """All lists that have come. Raises ValueError for what is not msgpack: user code has written into the pipe."""
-        self._end_copy()
+        if _Copy.made:
+            os._exit(0)
         items: list[list[Any]] = []
         with contextlib.suppress(BlockingIOError):
             while not self._ended:
@@ -115,11 +117,6 @@ class Pipe:
         except msgpack.BufferFull as fault:
             raise ValueError(f"a record of more than {LARGEST} bytes") from fault
 
-    @staticmethod
-    def _end_copy() -> None:
-        if _Copy.made:
-            os._exit(0)
-
     def close(self) -> None:
         """Let it go."""
         self.closed = self._ended = True
@@ -132,6 +129,7 @@ class Counter:
     def __init__(self, descriptor: int) -> None:
         """Take over a descriptor of `counter_memory`."""
         self._memory = mmap.mmap(descriptor, _NUMBER.size)
+        self._counted = 0
         os.close(descriptor)
 
     @property
@@ -141,7 +139,8 @@ class Counter:
 
     def count(self) -> None:
         """One more."""
-        _NUMBER.pack_into(self._memory, 0, self.value + 1)
+        self._counted += 1
+        _NUMBER.pack_into(self._memory, 0, self._counted)
 
     def close(self) -> None:
         """Let the memory go."""

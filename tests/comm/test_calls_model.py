@@ -124,7 +124,7 @@ class World:
     def flood(self, calls: int) -> None:
         """Another client calls, under ids that have nothing in common. No CALL of ours is on its way for that long."""
         self.stale.clear()
-        self.callee.link_up(self.now, "flood", m.Hello(1, 1, "client", "flood", "f1"))
+        self.callee.link_up(self.now, "flood", m.Hello(2, 2, "client", "flood", "f1"))
         for _ in range(calls):
             id_ = f"flood {next(self.numbers)} flood"
             assert self.callee.answer_inline(self.now, "flood", m.Call(id_, "flooded")) is not None
