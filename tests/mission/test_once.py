@@ -252,7 +252,8 @@ def test_a_run_that_was_stopping_and_is_forgotten_has_stopped_when_its_fence_is_
 
 
 def test_a_run_of_another_boot_that_is_cancelled_again_is_not_said_never_to_have_begun() -> None:
-    """Ordered, cancelled, executed for a moment; then both are killed: the new boot knows nothing of it, and says so twice."""
+    """Ordered, cancelled, executed for a moment; then both are killed: the new boot knows nothing of it, and still says so to
+    the process after the next kill."""
     world = World()
     world.ring()
     world.kill(True)
@@ -260,6 +261,7 @@ def test_a_run_of_another_boot_that_is_cancelled_again_is_not_said_never_to_have
     world.reboot()
     world.resume()
     world.exchange()
+    world.kill(False)
     (record, *_) = world.end()
     assert record.run == "work#1" and record.cancelled and record.executed is Executed.UNKNOWN
 
