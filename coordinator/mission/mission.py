@@ -180,6 +180,8 @@ class Mission:
         self.remarks: dict[str, str] = {}
         """What else the result tells, from whoever drives the mission run: that the host was too busy for it."""
         self._early: list[tuple[str, Notice]] = []
+        self._resumed = False
+        """Whether an earlier process may have asked for the preparation or the score."""
         task = executor.task.flat
         index = task.net.place_index.get(task.runs_place) if task.runs_place else None
         self.tally = Tally(index)
@@ -207,6 +209,7 @@ class Mission:
 
     def resume(self, now: float, stages: Mapping[str, Mapping[str, Any]]) -> None:
         """Go on behind the last step relived; `stages` are those that the journal says to be over."""
+        self._resumed = True
         if SCORED in stages:
             self.score, self.stage = stages[SCORED], Stage.OVER
         elif self.executor.finished is not None:
@@ -313,7 +316,8 @@ class Mission:
             return False
         caller = self.callers[self.executor.directory.where(service)]
         identity = f"{self.executor.mission}/{what}"
-        caller.call(now, Call(identity, service, arguments, SERVICE_DEADLINE, seed=self.executor.seed))
+        seed = self.executor.seed
+        caller.call(now, Call(identity, service, arguments, SERVICE_DEADLINE, seed=seed, again=self._resumed))
         return True
 
     def _is_own(self, outcome: Outcome) -> bool:

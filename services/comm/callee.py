@@ -154,7 +154,8 @@ class Callee:
             return
         if call.boot and call.boot != self.boot:
             text = f"this call was meant for another boot of {self.name}"
-            self._messages.append((peer, Outcome(id_, ERROR, {}, "rebooted", text, Executed.UNKNOWN)))
+            # Kept: a CANCEL that follows must not be answered as if the call had never left its caller.
+            self._end(now, peer, Outcome(id_, ERROR, {}, "rebooted", text, Executed.UNKNOWN))
             return
         if call.again and not self._results.gone.complete:
             # Before any refusal: that would say that it was not executed.

@@ -67,8 +67,8 @@ class FinishedIds:
         self.complete = True
         """Whether no id was ever forgotten: then an unknown id has never been here."""
 
-    def __contains__(self, id_: object) -> bool:
-        text, number = _split(str(id_))
+    def __contains__(self, id_: str) -> bool:
+        text, number = _split(id_)
         return self._groups.get((text, number // _GROUP), 0) >> number % _GROUP & 1 == 1
 
     def add(self, id_: str) -> None:
@@ -83,8 +83,12 @@ class FinishedIds:
 
 def _split(id_: str) -> tuple[str, int]:
     """An id as its text and its trailing number; no two ids give the same, since leading zeros stay with the text."""
-    digits = len(id_[len(id_.rstrip(_DIGITS)) :].lstrip("0"))
-    return (id_[:-digits], int(id_[-digits:])) if digits else (id_, 0)
+    text = id_.rstrip(_DIGITS)
+    digits = id_[len(text) :]
+    if digits[:1] == "0":
+        digits = digits.lstrip("0")
+        text = id_[: len(id_) - len(digits)]
+    return text, int(digits) if digits else 0
 
 
 class ResultStore:

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from coordinator.engine import Engine
 from coordinator.launch import Setting, lockstep_cell
+from coordinator.mission.executor import Executor
 from coordinator.mission.mission import Mission
 from coordinator.mission.partners import FirstAlternative
 from coordinator.record.timeline import Timeline
 from coordinator.task import Status, Task
+from coordinator.taskfile import loads
 from services.action import Status as ActionStatus
+from services.comm import messages as m
+from services.comm.caller import Caller
+from services.comm.directory import parse
 from services.scripted import Line
 from tests.mission.scripted_cell import directory_for, scripts
+from tests.mission.toy_arm import SERVICES, TASK
 
 
 def run(task: Task, lines: dict[str, list[Line]], **given: Any) -> tuple[Mission, Timeline]:
@@ -126,3 +134,24 @@ def test_the_user_chooses_the_action(catch_ball: Task) -> None:
     track = next(r for r in mission.tally.runs if r.place == "track_ball")
     assert track.action == "predict_kalman"
     assert (track.status, track.cause) == (Status.ERROR, "not_offered")
+
+
+def test_a_preparation_that_may_have_been_asked_for_before_says_so() -> None:
+    """A node that has forgotten its oldest calls does not prepare the cell a second time for a resumed coordinator."""
+    text = TASK.replace('name = "toy"', 'name = "toy"\nprepare = "lab_prepare"')
+    places = parse(
+        SERVICES.replace("ON_RESUME", "rejoin") + '[services.lab_prepare]\nrun = "toy:prepare"\nnode = "motion"\n',
+        Path("services.toml"),
+    )
+    asked = []
+    for resumed in (False, True):
+        caller = Caller("motion", m.Hello(1, 1, "coordinator", "m", "c1", 1))
+        task = loads(text, "toy")
+        mission = Mission(Executor(task, Engine(task), places, {"motion": caller}, "m"), {}, 1)
+        caller.link_up(0.0, m.Welcome(1, "motion", "n1"))
+        if resumed:
+            mission.resume(0.0, {})
+        else:
+            mission.start(0.0)
+        asked += [(call.id, call.again) for call in caller.messages(0.0) if isinstance(call, m.Call)]
+    assert asked == [("m/prepare", False), ("m/prepare", True)]

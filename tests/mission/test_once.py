@@ -251,6 +251,21 @@ def test_a_run_that_was_stopping_and_is_forgotten_has_stopped_when_its_fence_is_
     assert world.bench.calls() == [TIDY]
 
 
+def test_a_run_of_another_boot_that_is_cancelled_again_is_not_said_never_to_have_begun() -> None:
+    """Ordered, cancelled, executed for a moment; then both are killed: the new boot knows nothing of it, and still says so to
+    the process after the next kill."""
+    world = World()
+    world.ring()
+    world.kill(True)
+    assert world.started == {WORK: 1}
+    world.reboot()
+    world.resume()
+    world.exchange()
+    world.kill(False)
+    (record, *_) = world.end()
+    assert record.run == "work#1" and record.cancelled and record.executed is Executed.UNKNOWN
+
+
 def test_a_call_lost_on_its_way_is_made_again_by_a_node_that_forgot_nothing() -> None:
     """The guard costs nothing where it is not needed: a day later too."""
     world = World(Keeping())
