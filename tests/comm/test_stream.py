@@ -7,6 +7,7 @@ import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
 
+import msgpack
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,7 +17,7 @@ from services.comm.security import KeyNeededError
 from services.comm.stream import Incoming, Inlet, StreamReceiver, StreamSender
 from services.comm.stream_line import Lateness
 
-from .ends import frame
+from .ends import frame, framed
 
 
 class Sink:
@@ -196,7 +197,7 @@ MALFORMED = [
     pytest.param([b"\x00\x00\x00\x05hello"], id="random bytes"),
     pytest.param([OPENING, frame(m.SetPoint(1, (1.0,)))], id="no STREAM_OPEN"),
     pytest.param([OPENING, frame(m.StreamOpen("catch_point", 0.04, "t1")), b"\xff" * 9], id="bad set point"),
-    pytest.param([OPENING, frame(m.SetPoint(1, (math.nan,)))], id="nan"),
+    pytest.param([OPENING, framed(msgpack.packb([m.SetPoint.KIND, 1, [math.nan]]))], id="nan"),
 ]
 
 
