@@ -53,8 +53,8 @@ async def test_who_has_a_certificate_of_the_cell_is_served(victim: Start, certif
     client.start()
     async with asyncio.timeout(60.0):
         assert (await client.call("echo", {"n": 1})).values == {"n": 1}
-        big = (await client.call("echo", {"b": bytes(3 << 20)})).values
-    assert big == {"b": bytes(3 << 20)}
+        big = (await client.call("echo", {"b": bytes(15 << 17)})).values
+    assert big == {"b": bytes(15 << 17)}
     link = client._link
     assert link is not None and link._transport is not None
     assert link._transport.get_extra_info("ssl_object").version() == "TLSv1.3"
