@@ -174,7 +174,8 @@ class Dispatch:
         if flight is None:
             return []
         self._command_count += 1
-        key = f"{self._mission}/{verb}#{self._command_count}"
+        epoch = self.callers[flight.node].hello.epoch  # a resumed run counts from 1 again
+        key = f"{self._mission}/{epoch}/{verb}#{self._command_count}"
         if verb == "hold":
             self._commands[key] = run
         self.callers[flight.node].command(now, Command(key, verb, flight.device, {"run": self.call_id(run)}))

@@ -87,7 +87,8 @@ class Watching:
         """Send a node an operator's command that is no stimulus: nothing waits for its answer."""
         self._numbers += 1
         now = self._shell.now()
-        id_ = f"{self._mission.executor.mission}/operator/{verb}#{self._numbers}"
+        epoch = self._mission.callers[node].hello.epoch  # a resumed run counts from 1 again
+        id_ = f"{self._mission.executor.mission}/{epoch}/operator/{verb}#{self._numbers}"
         self._mission.callers[node].command(now, Command(id_, verb))
         self._shell.flush(node)
 

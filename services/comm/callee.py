@@ -89,8 +89,8 @@ class Callee:
         self._results = ResultStore(self._keeping, self.events.forget_run)
         self._commands: dict[str, tuple[str, str]] = {}
         """Peer and verb of each command that waits for its answer."""
-        self._answers: OrderedDict[str, tuple[str, Answer]] = OrderedDict()
-        """The newest answers with their callers, for a command that comes again."""
+        self._answers: OrderedDict[tuple[str, str], Answer] = OrderedDict()
+        """The newest answers by caller and command, for a command that comes again."""
         self._orders: list[Order] = []
         self._messages: list[tuple[str, Message]] = []
         self._takers: Mapping[type, Callable[[float, str, Any], None]] = {
@@ -112,6 +112,10 @@ class Callee:
         refusal = self._peers.refusal(peer, hello)
         if refusal is not None:
             return refusal
+        known = self._peers.get(peer)
+        if known is None or (known.boot, known.epoch) != (hello.boot, hello.epoch):
+            # Another process of that name counts its commands from the beginning again.
+            self._answers = OrderedDict((key, kept) for key, kept in self._answers.items() if key[0] != peer)
         forgotten = self._peers.come(peer, hello, local)
         self.events.peer_down(forgotten, leaves=True)
         self._messages.extend((peer, event) for event in self.events.waiting(peer))
@@ -269,7 +273,7 @@ class Callee:
         self.events.acknowledge(peer, ack.source, ack.number)
 
     def _take_command(self, now: float, peer: str, command: Command) -> None:
-        if command.id in self._commands or command.id in self._answers:
+        if command.id in self._commands or (peer, command.id) in self._answers:
             self._known_command(peer, command.id)
             return
         self._commands[command.id] = peer, command.verb
@@ -280,12 +284,11 @@ class Callee:
 
     def _known_command(self, peer: str, id_: str) -> None:
         """A command that came before is not carried out again: its answer is said again, or comes when it is there."""
-        owner, answer = self._answers.get(id_) or (self._commands[id_][0], None)
-        if owner != peer:
+        if (answer := self._answers.get((peer, id_))) is not None:
+            self._messages.append((peer, answer))
+        elif (owner := self._commands[id_][0]) != peer:
             text = f"{owner} gave a command of this id"
             self._messages.append((peer, Answer(id_, False, {"cause": "id_taken", "text": text})))
-        elif answer is not None:
-            self._messages.append((peer, answer))
 
     # What the node reports.
 
@@ -365,7 +368,7 @@ class Callee:
             answers = data.get("answers", {})
             self._running.hold_all(now, ["" if d == self.name else d for d, said in answers.items() if said == HELD])
         answer = Answer(id, ok, plain(data or {}, "data"))
-        self._answers[id] = peer, answer
+        self._answers[peer, id] = answer
         if len(self._answers) > ANSWERS:
             self._answers.popitem(last=False)
         self._send(peer, answer)

@@ -342,6 +342,20 @@ def test_commands_go_to_the_node_and_their_answers_back() -> None:
     assert callee.messages() == [("coord", m.Answer("k1", True, {"arm": "held"}))]
 
 
+def test_a_restarted_caller_counts_its_commands_anew() -> None:
+    """The answer that its former process got is no answer to the command of the same id now."""
+    callee = _callee()
+    command = m.Command("k1", "hold", "arm")
+    callee.receive(0.0, "coord", command)
+    callee.orders()
+    callee.answer(0.1, "k1", True, {"arm": "held"})
+    callee.link_down(1.0, "coord")
+    assert isinstance(callee.link_up(2.0, "coord", m.Hello(2, 2, "coordinator", "coord", "c2", 4)), m.Welcome)
+    callee.messages()
+    callee.receive(2.1, "coord", command)
+    assert callee.orders() == [Commanded(command, "coord")] and callee.messages() == []
+
+
 def test_reports_about_what_does_not_go_on_are_the_nodes_own_fault() -> None:
     callee = _callee()
     with pytest.raises(ValueError, match="no such run"):
@@ -423,20 +437,26 @@ def test_a_held_run_is_still_an_orphan_without_its_caller() -> None:
 
 
 def test_a_repeated_command_is_not_carried_out_again() -> None:
-    """While it waits for its answer nothing happens; afterwards the same answer is said; another caller's id is his own."""
+    """While it waits for its answer nothing happens. Afterwards the same answer is said.
+
+    Another caller may use an id again once it is answered, but not before.
+    """
     callee = _callee(COORD, m.Hello(2, 2, "client", "other", "o1"))
     callee.messages()
     stop = m.Command("k1", "stop", "arm")
     for _ in range(3):
         callee.receive(0.0, "coord", stop)
     assert callee.orders() == [Commanded(stop, "coord")] and callee.messages() == []
+    callee.receive(0.1, "other", stop)
+    [(peer, answer)] = callee.messages()
+    assert peer == "other" and isinstance(answer, m.Answer) and answer.data["cause"] == "id_taken"
     callee.answer(0.1, "k1", True, {"answers": {"arm": "stopped"}})
     (said,) = callee.messages()
     callee.receive(0.2, "coord", stop)
     assert callee.orders() == [] and callee.messages() == [said]
     callee.receive(0.3, "other", stop)
-    [(peer, answer)] = callee.messages()
-    assert peer == "other" and isinstance(answer, m.Answer) and answer.data["cause"] == "id_taken"
+    assert callee.orders() == [Commanded(stop, "other")] and callee.messages() == []
+    callee.answer(0.4, "k1", True)
     for number in range(1_000):
         callee.receive(1.0, "coord", m.Command(f"more {number}", "status"))
         callee.answer(1.0, f"more {number}", True)

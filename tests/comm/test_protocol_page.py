@@ -20,7 +20,8 @@ from .ends import frame
 PAGE = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text(encoding="utf-8")
 ROWS = {int(row[1]): row for row in re.finditer(r"^\| (\d+) (\w+) \| (\w+) \| (.*) \| ([\d]+ \w+) \|$", PAGE, re.M)}
 UNITS = {"B": 1, "KiB": 1024, "MiB": 1024 * 1024}
-CODE = "\n".join(path.read_text(encoding="utf-8") for path in (Path(m.__file__).parent).glob("*.py"))
+SERVICES = Path(m.__file__).parents[1]
+CODE = "\n".join(path.read_text(encoding="utf-8") for path in [*SERVICES.glob("comm/*.py"), *SERVICES.glob("*.py")])
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)

@@ -7,6 +7,7 @@ caller on one connection is answered throughout, a new one is let in, and the no
 from __future__ import annotations
 
 import contextlib
+import itertools
 import random
 import socket
 import subprocess
@@ -29,6 +30,7 @@ pytestmark = pytest.mark.processes
 GROWTH = 24 << 20
 """Bytes by which the node may be larger after an attack than before."""
 MIB = 1 << 20
+ASKED = itertools.count()
 BEAT = 0.1
 """Seconds after which the good caller speaks again: silent for 1 s it would be cut, too."""
 
@@ -79,11 +81,12 @@ def vision(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Vision]:
     process.communicate(timeout=60.0)
 
 
-def ask(client: Foreign, number: int) -> None:
+def ask(client: Foreign) -> None:
     """The good caller's question: how are you."""
-    client.say(f.COMMAND, f"ask {number}", "status")
-    answer = client.expect(f.ANSWER, f"ask {number}")
-    assert answer[2] and "camera" in answer[3]["devices"]
+    id_ = f"ask {next(ASKED)}"  # the id of a command belongs to one caller
+    client.say(f.COMMAND, id_, "status")
+    answer = client.expect(f.ANSWER, id_)
+    assert answer[2] and "camera" in answer[3]["devices"], answer
 
 
 def _hello(name: str) -> bytes:
@@ -118,7 +121,7 @@ def attack(vision: Vision, connections: int) -> None:
     """So many connections that are no good; the good caller asks ten times a second and is answered each time."""
     random_ = random.Random(connections)
     good = vision.good("good")
-    ask(good, 0)
+    ask(good)
     before, open_before, asked = vision.size(), vision.sockets(), time.monotonic()
     for number in range(1, connections + 1):
         stranger = vision.stranger()
@@ -131,14 +134,14 @@ def attack(vision: Vision, connections: int) -> None:
                     pass
         stranger.close()
         if time.monotonic() > asked + BEAT:
-            ask(good, number)
+            ask(good)
             asked = time.monotonic()
     good.say(f.BYE)
     good.close()
-    ask(after := vision.good("after"), 0)
+    ask(after := vision.good("after"))
     limit = Limit("the sockets to be closed")
     while vision.sockets() > open_before and limit.left():
-        ask(after, 1)
+        ask(after)
     after.close()
     assert vision.process.poll() is None
     assert vision.size() - before < GROWTH
@@ -162,7 +165,7 @@ def test_dripping_handshakes_keep_nobody_out(vision: Vision) -> None:
             with contextlib.suppress(ConnectionError):
                 one.sendall(hello[at : at + 1])
         good = vision.good(f"between {at}")
-        ask(good, at)
+        ask(good)
         good.say(f.BYE)
         good.close()
     for one in drips:
@@ -192,7 +195,7 @@ def test_what_is_beyond_all_limits_is_refused_and_costs_nothing(vision: Vision, 
         bad.raw(body)
         assert bad.hear()[:2] == [f.REFUSE, code]
         bad.close()
-        ask(good, number)
+        ask(good)
     good.say(f.BYE)
     good.close()
     assert vision.size() - before < GROWTH
@@ -205,11 +208,11 @@ def test_bodies_that_never_end_are_bounded(vision: Vision) -> None:
         one = vision.good(f"endless {number}")
         one.raw(head(2 * MIB) + b"\x94\x04\xa11\xa1s" + bytes(MIB))
         open_.append(one)
-        ask(good, number)
+        ask(good)
     number, limit = 0, Limit("the silent ones to be cut")
     while open_ and limit.left():  # they are silent: each is cut after 1 s
         number += 1
-        ask(good, 100 + number)
+        ask(good)
         open_ = [one for one in open_ if not hung_up(one)]
     good.close()
 
