@@ -10,6 +10,8 @@ from tests.proof.proof import Proof
 HEAD = """# Figures
 
 Written by `make proof`, which anyone can repeat: it resumes where it stopped and measures again what has changed since.
+
+What came of faults that were injected on purpose: [figures-faults.md](figures-faults.md).
 """
 
 
