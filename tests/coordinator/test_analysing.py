@@ -16,6 +16,7 @@ import pytest
 
 from coordinator import analysing
 from coordinator.analysing import Apart, RefusedError, Superseded, analyse_apart, analysed
+from tests.waiting import until
 
 CATCH_BALL = (Path(analysing.__file__).parent / "tasks" / "catch_ball.toml").read_text(encoding="utf-8")
 
@@ -111,8 +112,7 @@ async def test_a_newer_drawing_takes_the_place_of_the_older_one(apart: Apart) ->
     """Running or waiting, the older ones are given up at once; those of other desks and other work are not."""
     endless = {"text": CATCH_BALL.replace("tokens = 4", "tokens = 4000"), "filename": "catch_ball.toml"}
     first = asyncio.create_task(apart.do("analysis", endless, "desk 1"))
-    while apart.process is None:
-        await asyncio.sleep(0)
+    await until(lambda: apart.process is not None, "its process to start")
     other = asyncio.create_task(apart.do("findings", FINDINGS, "desk 2"))
     second = asyncio.create_task(apart.do("analysis", endless, "desk 1"))
     third = asyncio.create_task(apart.do("findings", FINDINGS, "desk 1"))
@@ -134,8 +134,7 @@ async def test_one_that_was_killed_is_started_again(apart: Apart) -> None:
 @pytest.mark.processes
 async def test_an_order_that_is_not_wanted_any_more_ends_its_process(apart: Apart) -> None:
     order = asyncio.create_task(apart.do("findings", FINDINGS))
-    while apart.process is None:
-        await asyncio.sleep(0)
+    await until(lambda: apart.process is not None, "its process to start")
     order.cancel()
     with pytest.raises(asyncio.CancelledError):
         await order

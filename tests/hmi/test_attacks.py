@@ -23,6 +23,8 @@ from tests.hmi.test_doors import ask, base, bearer, port_of
 from tests.hmi.test_protocol import joined
 from tests.station.test_starting import Simulated
 
+pytestmark = pytest.mark.processes
+
 CLIMBING = [
     "..",
     "../..",

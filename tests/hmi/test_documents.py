@@ -20,6 +20,8 @@ from coordinator.hmi.server import Page
 from coordinator.taskfile import load, loads
 from tests.hmi.stage import Stage
 
+pytestmark = pytest.mark.processes
+
 TASK = "pick_and_place"
 
 FORBIDDEN = (

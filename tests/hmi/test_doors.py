@@ -22,6 +22,8 @@ from coordinator.hmi.sessions import LARGEST_MESSAGE
 from tests.hmi.stage import Stage
 from tests.waiting import beat
 
+pytestmark = pytest.mark.processes
+
 EVIL = "http://evil.example"
 
 

@@ -29,7 +29,7 @@ BATCH = 1_500
 """Calls that are under way at once: more than the results that a node keeps, so that it drops those of the mission run."""
 
 
-async def _flood(port: int, ids: Callable[[int], str], calls: int) -> None:
+async def _flood(node: str, port: int, ids: Callable[[int], str], calls: int) -> None:
     """Another client makes so many calls, each answered."""
     over, left = asyncio.Event(), 0
 
@@ -39,7 +39,7 @@ async def _flood(port: int, ids: Callable[[int], str], calls: int) -> None:
         if left <= 0:
             over.set()
 
-    caller = Caller("flooded", Hello(1, 1, "client", "flood", "f1"), auto_ack=True)
+    caller = Caller(node, Hello(2, 2, "client", "flood", "f1"), auto_ack=True)
     client = Client("127.0.0.1", port, caller, on_notices=count)
     client.start()
     assert await client.connected(PATIENCE)
@@ -99,7 +99,7 @@ def test_what_a_flood_made_its_node_forget_is_not_run_again(
             )
         )
         for node in load(services).nodes.values():
-            asyncio.run(_flood(node.port, ids, calls))
+            asyncio.run(_flood(node.name, node.port, ids, calls))
         resumed = petrobot(tmp_path, "resume", str(run), "--json", str(tmp_path / "out.json"), *QUIET)
         assert resumed.wait(PATIENCE) == 0, (tmp_path / "resume.txt").read_text()
     finally:

@@ -105,7 +105,7 @@ def petrobot(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
             "nothing is right in step",
         ),
         (GIVE.format(port="{port}", kind="long cause"), "bad_result", "found 1,234: put long words into the text"),
-        (GIVE.format(port="{port}", kind="many containers"), "bad_result", "more than 100,000 lists and dicts"),
+        (GIVE.format(port="{port}", kind="many containers"), "bad_result", "more than 20,000 lists and dicts"),
         (GIVE.format(port="{port}", kind="65 MiB"), "bad_result", "above its limit"),
         (GIVE.format(port="{port}", kind="KeyboardInterrupt"), "exception", "KeyboardInterrupt"),
         (GIVE.format(port="{port}", kind="an event with a long name"), "exception", "found 256"),

@@ -12,6 +12,8 @@ import pytest
 
 from tests.integration.cell_files import ROOT, services_file
 
+pytestmark = pytest.mark.processes
+
 DESK = """
 [nodes.desk]
 host = "127.0.0.1"

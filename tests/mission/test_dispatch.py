@@ -337,7 +337,7 @@ def test_a_sync_from_outside_leaves_nothing_due(tmp_path: Path) -> None:
 @pytest.mark.parametrize("arguments", [{"x": {1: 2}}, {"x": [[]] * 60_000, "y": [[]] * 60_000}, {"x": 2**70}])
 def test_arguments_that_no_message_carries_end_their_run_alone(arguments: dict[str, Any]) -> None:
     """Two results, each small enough, may be too much for the one call that they are fed to."""
-    caller = Caller("motion", m.Hello(1, 1, "coordinator", "m", "c1", 1))
+    caller = Caller("motion", m.Hello(2, 2, "coordinator", "m", "c1", 1))
     dispatch = Dispatch(directory(), {"motion": caller}, "m", 0)
     (end,) = dispatch.carry_out(0.0, StartRun("work#1", "work", "work", "do_work", arguments, 1.0))
     assert isinstance(end, RunEnded)

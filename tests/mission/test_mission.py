@@ -145,7 +145,7 @@ def test_a_preparation_that_may_have_been_asked_for_before_says_so() -> None:
     )
     asked = []
     for resumed in (False, True):
-        caller = Caller("motion", m.Hello(1, 1, "coordinator", "m", "c1", 1))
+        caller = Caller("motion", m.Hello(2, 2, "coordinator", "m", "c1", 1))
         task = loads(text, "toy")
         mission = Mission(Executor(task, Engine(task), places, {"motion": caller}, "m"), {}, 1)
         caller.link_up(0.0, m.Welcome(1, "motion", "n1"))

@@ -85,7 +85,7 @@ class World:
 
     def flood(self, calls: int) -> None:
         """Another client calls, under ids that have nothing in common, and acknowledges or does not."""
-        self.callee.link_up(self.now, "flood", m.Hello(1, 1, "client", "flood", "f1"))
+        self.callee.link_up(self.now, "flood", m.Hello(2, 2, "client", "flood", "f1"))
         for _ in range(calls):
             self.floods += 1
             id_ = f"flood {self.floods} flood"

@@ -146,7 +146,7 @@ RUN = textwrap.dedent("""\
     from pathlib import Path
     file = Path(sys.argv[1])
     node = LockstepNode(parse(file.read_text(), file), "only")
-    node.receive(0.0, Envelope("only", "coordinator", "only", "call", Hello(1, 1, "coordinator", "coordinator", "b", 1)))
+    node.receive(0.0, Envelope("only", "coordinator", "only", "call", Hello(2, 2, "coordinator", "coordinator", "b", 1)))
     node.receive(0.0, Envelope("only", "coordinator", "spin", "call", Call("m/p#1", "spin", epoch=1)))
     for tick in range(100):
         node.advance(tick * 0.004)
@@ -158,6 +158,7 @@ RUN = textwrap.dedent("""\
 """)
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize("stubborn", [False, True])
 def test_an_action_that_does_not_come_back_is_named(tmp_path: Path, stubborn: bool) -> None:
     """Its run ends in ERROR, or the process where it lets nobody interrupt it; node, action, run and line are said."""

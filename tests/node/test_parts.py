@@ -346,6 +346,7 @@ def test_a_counter_can_be_read_after_the_end_of_the_one_that_counts() -> None:
     mine.close()
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize("missing", [False, True])
 async def test_the_end_of_a_process_is_noticed_whoever_holds_its_pipe(
     missing: bool, monkeypatch: pytest.MonkeyPatch

@@ -12,6 +12,7 @@ from services.worker import COMMAND, STREAM_AT, WANTED, Setup
 from services.worker_pool import IDLE_LIMIT, KEPT, WorkerPool
 from tests.node.conftest import Clock
 from tests.node.test_worker_place import FakeChild
+from tests.waiting import Limit
 
 
 class Pool:
@@ -53,7 +54,8 @@ class Pool:
 
     def run(self, seconds: float = 0.0) -> list[Any]:
         until, fresh = self.clock.now + seconds, []
-        while True:
+        limit = Limit("the pool to rest", steps=10_000)
+        while limit.left():
             self.pool.advance(self.clock.now)
             fresh += self.pool.reports()
             due = self.pool.due()

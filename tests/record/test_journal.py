@@ -19,9 +19,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coordinator.record.journal import MAGIC, JournalError, JournalWriter, read_journal
-from services.comm.codec import encode
+from services.comm.codec import LIMITS, encode
 from services.comm.messages import Outcome
-from services.comm.plain import LARGEST
 
 PLAIN = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**60), 2**60) | st.floats(allow_nan=False) | st.text(max_size=20),
@@ -207,8 +206,9 @@ def test_kill_9_loses_nothing_that_was_synced(tmp_path: Path) -> None:
 
 def test_the_largest_result_that_a_node_can_send_finds_room(tmp_path: Path) -> None:
     """A journal that could not keep what was accepted would end the coordinator."""
-    values = {"x": bytes(LARGEST - 200)}
-    assert len(encode(Outcome("mission/work#1", "success", values))) <= LARGEST
+    largest = LIMITS[Outcome.KIND]
+    values = {"x": bytes(largest - 200)}
+    assert largest - 200 < len(encode(Outcome("mission/work#1", "success", values))) <= largest
     ended = {"type": "RunEnded", "run": "work#1", "status": "success", "values": values, "text": "t" * 2_000}
     journal = read_journal(written(tmp_path, [("stimulus", {"time": 1.0, "stimulus": ended, "check": 7})]))
     assert journal.records[0].data["stimulus"] == ended

@@ -10,6 +10,8 @@ from coordinator.record.journal import read_journal
 from coordinator.record.runfolder import JOURNAL
 from tests.station.conftest import Cell
 
+pytestmark = pytest.mark.processes
+
 
 async def test_a_run_in_real_time_takes_the_whole_order(
     cell: Cell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

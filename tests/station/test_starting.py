@@ -28,6 +28,8 @@ from services.comm.directory import parse
 from tests.station.conftest import SCRIPT, SERVICES, TASK, Cell
 from tests.waiting import beat
 
+pytestmark = pytest.mark.processes
+
 REMARKED = TASK.replace(
     "speed = 0.5", 'speed = 0.5 # m/s\nquiet = false\nbatch = "A" # which\ncount = 3\nregime = "calm"'
 )

@@ -14,6 +14,8 @@ from coordinator.record.journal import read_journal
 from coordinator.record.runfolder import JOURNAL, RESULT, NoRunError
 from tests.station.conftest import TASK, Cell
 
+pytestmark = pytest.mark.processes
+
 
 async def test_a_task_runs_again_and_again_over_real_nodes(cell: Cell) -> None:
     """Each run has a journal and a result of its own; what the page knew of its operator stays."""

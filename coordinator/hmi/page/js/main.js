@@ -97,7 +97,7 @@ class LostBar {
   constructor(link) {
     this.link = link;
     this.text = h("span");
-    this.key = h("input", { type: "text", "aria-label": "Printed address", placeholder: "http://…/?token=…", autocomplete: "off", spellcheck: "false" });
+    this.key = h("input", { type: "text", "aria-label": "Printed address", placeholder: "…/?token=…", autocomplete: "off", spellcheck: "false" });
     this.form = h("form", { class: "row", hidden: true, onsubmit: (event) => this.enter(event) }, this.key, h("button", { type: "submit", class: "small" }, "Open"), h("a", { href: "/" }, "or load this page again"));
     this.root = h("div", { class: "lost", role: "alert", hidden: true }, icon("link"), this.text, this.form);
   }
