@@ -39,8 +39,8 @@ class NodeEntry:
     sim: str = ""
     """Import path of what makes the simulated laboratory's party, `function(directory, name)`; empty for a real node."""
     worker_memory_mb: int = 4096
-    """Limit of the address space of each worker process (MiB). Address space, not memory in use: numpy, opencv, scipy and numba
-    together reserve less than 1 GiB on a small host, but some libraries reserve more for each core."""
+    """Limit of the address space of each worker process (MiB). Address space, not memory in use: numpy, opencv and scipy
+    together reserve about 0.6 GiB on a small host; some libraries reserve more for each core."""
     workers: int = 32
     """Most worker processes for actions without a device: as many runs of such actions at a time."""
 
