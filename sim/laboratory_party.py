@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import Any, ClassVar
 
-from services.comm.callee import Callee, Offer
+from services.comm.callee import Callee, Commanded, Offer, Order
 from services.comm.canbus import Frame
 from services.comm.channels import can_body, image_body, read_can, read_images_wanted
 from services.comm.messages import Call, Executed, Outcome
@@ -19,6 +19,12 @@ from services.comm.party import TICK, Envelope
 from sim.exposures import Exposures
 
 PREPARE, SCORE, FAULT = SERVICES = ("laboratory_prepare", "laboratory_score", "laboratory_fault")
+
+
+def answer_command(now: float, callee: Callee, order: Order) -> None:
+    """Answer an operator's command: a laboratory is up, and has no device that could be held or stopped."""
+    if isinstance(order, Commanded):
+        callee.answer(now, order.command.id, True, {"answers": {}, "devices": {}, "emergency": []})
 
 
 class LaboratoryParty(ABC):
@@ -88,6 +94,8 @@ class LaboratoryParty(ABC):
         self._send_frames()
         self._send_images(now)
         self.callee.advance(now)
+        for order in self.callee.orders():
+            answer_command(now, self.callee, order)
         for peer, message in self.callee.messages():
             self._out.append(Envelope(peer, self.name, peer, "call", message))
 

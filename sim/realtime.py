@@ -33,7 +33,7 @@ from services.comm.listening import listening, refuse_unusable
 from services.comm.messages import Call, Outcome
 from services.comm.party import TICK
 from services.comm.server import Server
-from sim.laboratory_party import LaboratoryParty
+from sim.laboratory_party import LaboratoryParty, answer_command
 from sim.truth import LaboratoryError
 
 SLIP: Final = 0.1
@@ -206,6 +206,7 @@ class LaboratoryShell:
     def _obey(self, now: float, orders: list[Order]) -> None:
         """Preparations alone are runs; they cannot be stopped, only waited for."""
         for order in orders:
+            answer_command(now, self.server.callee, order)
             if isinstance(order, StartRun):
                 task = asyncio.get_running_loop().create_task(self._prepare(order.call))
                 self._preparing.add(task)

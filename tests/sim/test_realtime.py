@@ -12,10 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from services.comm.caller import Caller
 from services.comm.camera import StreamImages
 from services.comm.can_ports import StreamPort
+from services.comm.client import Client
 from services.comm.directory import load
-from services.comm.messages import Call, Outcome
+from services.comm.messages import Answer, Call, Command, Hello, Outcome
+from services.comm.notice import Answered, Notice
 from services.comm.party import TICK
 from sim.laboratory import Laboratory
 from sim.realtime import LaboratoryShell, bus_channel, camera_address
@@ -129,6 +132,24 @@ async def test_services_are_answered(shell: LaboratoryShell) -> None:
     assert (await ask(shell, "laboratory_fault", kind="slow_arm", factor=0.5)).status == "success"
     refused = await ask(shell, "laboratory_prepare", regime="Q")
     assert refused.status == "error" and "must begin with" in refused.text
+
+
+async def test_it_says_how_it_is(shell: LaboratoryShell) -> None:
+    """At once: who asks takes a node that does not answer for a frozen one."""
+    answered: list[Answer] = []
+
+    def hear(_: float, notices: list[Notice]) -> None:
+        answered.extend(notice.answer for notice in notices if isinstance(notice, Answered))
+
+    caller = Caller("laboratory", Hello(2, 2, "client", "asking", "a1"))
+    client = Client(*shell.server.address, caller, on_notices=hear)
+    client.start()
+    assert await client.connected(PATIENCE)
+    caller.command(client.now(), Command("asking/status", "status"))
+    client.flush()
+    await until(lambda: bool(answered))
+    await client.close()
+    assert answered == [Answer("asking/status", True, {"answers": {}, "devices": {}, "emergency": []})]
 
 
 async def test_a_fault_of_the_world_ends_the_shell(tmp_path: Path) -> None:
