@@ -56,11 +56,6 @@ NEWEST_VERSION: Final = 2
 _HEADER: Final = 4
 _HEAD: Final = struct.Struct(">IBB")
 """Length, then the first two bytes of the body: its array and the kind."""
-_LENGTH_BITS: Final = 25
-_LENGTH: Final = (1 << _LENGTH_BITS) - 1
-"""The bits of a frame's first word that are its length. On an open connection the other 7 are the length modulo 127, which
-any one changed bit breaks: a length that was made larger must not swallow the frames that follow before it is found out."""
-_MODULUS: Final = 127
 _head_at: Final = _HEAD.unpack_from
 _LARGE: Final = 4096
 _NO_QUICK: Mapping[int, int] = {}
@@ -143,8 +138,7 @@ class Connection:
         parts: list[bytes] = []
         seal, seal_bytes = self._seal_out.next, self._seal_bytes
         for body in encode_all(messages):
-            length = len(body) + seal_bytes
-            parts += (length | length % _MODULUS << _LENGTH_BITS).to_bytes(_HEADER, "big"), body, seal(body)
+            parts += (len(body) + seal_bytes).to_bytes(_HEADER, "big"), body, seal(body)
         return b"".join(parts)
 
     def _send_unusual(self, message: Message) -> bytes:
@@ -164,8 +158,7 @@ class Connection:
     def _frame(self, body: bytes) -> bytes:
         assert self._seal_out is not None
         length = len(body) + self._seal_bytes
-        word = length | length % _MODULUS << _LENGTH_BITS
-        return word.to_bytes(_HEADER, "big") + body + self._seal_out.next(body)
+        return length.to_bytes(_HEADER, "big") + body + self._seal_out.next(body)
 
     def _opening_refusal(self, body: bytes) -> bytes:
         # Proven by the seal that the first frame of the open connection would have had; nothing follows it.
@@ -243,13 +236,10 @@ class Connection:
         size, start, longest, seal_bytes = len(data), 0, self._quick_in.get, self._seal_bytes
         last, least = size - _HEAD.size, seal_bytes + 2
         while start < last:
-            word, array, kind = _head_at(data, start)
-            length = word & _LENGTH
+            length, array, kind = _head_at(data, start)
             body = start + _HEADER
             end = body + length
             if end > size or not least <= length <= longest(kind, 0) or array & 0xF0 != 0x90:
-                break
-            if word >> _LENGTH_BITS != length % _MODULUS:
                 break
             part = self._unsealed(data, body, end)
             message = None
@@ -294,10 +284,6 @@ class Connection:
             return 0
         length = int.from_bytes(data[start:body], "big")
         sealed = self._seal_bytes
-        if sealed:
-            word, length = length, length & _LENGTH
-            if word >> _LENGTH_BITS != length % _MODULUS:
-                raise ProtocolError("bad_check", "the length of a frame was changed on its way, or has no check")
         if length < 2 + sealed:
             raise ProtocolError("malformed", f"a frame of {length} bytes")
         if len(data) < body + 2:

@@ -14,8 +14,6 @@ import sys
 HANDSHAKE = 1
 """Frames at the beginning of each direction that are never repeated."""
 _LENGTH = struct.Struct(">I")
-_LENGTH_MASK = (1 << 25) - 1
-"""The bits of a frame's first word that are its length; the others check it."""
 
 
 class Pair:
@@ -46,7 +44,7 @@ class Pair:
         try:
             while True:
                 head = await source.readexactly(_LENGTH.size)
-                frame = head + await source.readexactly(_LENGTH.unpack(head)[0] & _LENGTH_MASK)
+                frame = head + await source.readexactly(_LENGTH.unpack(head)[0])
                 await self._open.wait()
                 target.write(frame)
                 frames += 1

@@ -121,8 +121,8 @@ def framed(body: bytes) -> bytes:
 
 
 def head(length: int) -> bytes:
-    """The first four bytes of a frame of an open connection."""
-    return (length | length % 127 << 25).to_bytes(4, "big")
+    """The first four bytes of a frame."""
+    return length.to_bytes(4, "big")
 
 
 def welcome(hello: bytes, name: str = "motion") -> bytes:

@@ -125,12 +125,7 @@ class Foreign:
             self.sent += 1
         else:
             end = struct.pack(">I", zlib.crc32(body))
-        return self.head(len(body) + len(end)) + body + end
-
-    @staticmethod
-    def head(length: int) -> bytes:
-        """The first four bytes of a frame of an open connection."""
-        return struct.pack(">I", length % 127 << 25 | length)
+        return struct.pack(">I", len(body) + len(end)) + body + end
 
     def say(self, *message: Any) -> None:
         """Send a message: kind and fields."""
@@ -151,12 +146,9 @@ class Foreign:
 
     def body(self) -> bytes:
         """The next frame's body, its seal or check looked at."""
-        word = int.from_bytes(self._exactly(4), "big")
+        body = self._exactly(int.from_bytes(self._exactly(4), "big"))
         if not self.is_open:
-            return self._exactly(word)
-        length = word & 0x1FFFFFF
-        assert word >> 25 == length % 127
-        body = self._exactly(length)
+            return body
         if not self.seal_in:
             body, end = body[:-4], body[-4:]
             assert end == struct.pack(">I", zlib.crc32(body))

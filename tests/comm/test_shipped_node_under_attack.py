@@ -177,7 +177,7 @@ def test_dripping_handshakes_keep_nobody_out(vision: Vision) -> None:
 @pytest.mark.parametrize(
     ("body", "code"),
     [
-        (b"\xff\xff\xff\xff\x99\x04", "bad_check"),
+        (b"\xff\xff\xff\xff\x99\x04", "too_large"),
         (head(16 * MIB + 5) + b"\x99\x04", "too_large"),
         (framed(b"\x94\x04\xa11\xa1s" + b"\x81\xa1a" * 5_000 + b"\xc0"), "malformed"),
         (framed(b"\x94\x04\xa11\xa1s\x81\xa1a" + b"\x91" * 5_000 + b"\xc0"), "malformed"),

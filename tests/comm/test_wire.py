@@ -534,11 +534,12 @@ def _assert_noticed(said: list[tuple[Side, bytes]], number: int, changed: bytes,
     for side, messages in got.items():
         its = [message for message in messages if not isinstance(message, m.Refuse)]
         assert its == right[side][: len(its)], "a wrong value was delivered"
-    assert noticed
+    waits = any(len(got[side]) < len(right[side]) for side in Side)
+    assert noticed or waits, "an incomplete frame is not heard, so the limit on silence ends the connection"
 
 
 def test_any_one_changed_bit_of_a_conversation_is_noticed(key: bytes | None) -> None:
-    """Also in the lengths: a frame made longer swallows no other before it is found out."""
+    """Also in the lengths: a frame made longer delivers nothing."""
     said = _conversation(key)
     right, noticed = _play(said, key)
     assert not noticed and [len(right[side]) for side in Side] == [5, 4]
@@ -547,8 +548,6 @@ def test_any_one_changed_bit_of_a_conversation_is_noticed(key: bytes | None) -> 
         for bit in range(8 * len(data)):
             changed = bytearray(data)
             changed[bit // 8] ^= 128 >> bit % 8
-            if number < 2 + 2 * (key is not None) and bit < 32 and int.from_bytes(changed[:4], "big") > len(data):
-                continue  # an opening frame that was made longer never completes: the handshake's time limit ends it
             _assert_noticed(said, number, bytes(changed), key)
             injections += 1
     assert injections > 2_000

@@ -30,8 +30,6 @@ KEY = bytes(range(32))
 HELLO = m.Hello(2, 2, "coordinator", "coord", "c1", 3)
 SCRIPT = Path(__file__).with_name("server_process.py")
 MIB = 1 << 20
-LENGTH = (1 << 25) - 1
-"""The part of a frame's first four bytes that is its length."""
 KEPT = 1 << 16
 """Bytes that a stranger keeps of what it hears, to replay them."""
 
@@ -175,7 +173,7 @@ class Stranger:
     async def _body(self) -> bytes:
         async with asyncio.timeout(60.0):
             head = await self.reader.readexactly(4)
-            body = await self.reader.readexactly(int.from_bytes(head, "big") & LENGTH)
+            body = await self.reader.readexactly(int.from_bytes(head, "big"))
         if len(self.heard) < KEPT:
             self.heard += head + body
         return body
